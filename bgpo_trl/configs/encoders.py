@@ -9,7 +9,24 @@ from bgpo_trl.configs.settings import Settings
 
 
 @dataclass(frozen=True)
-class VAEConfig(Settings):
+class FitConfig(Settings):
+    """Settings of any training by Adam."""
+
+    learning_rate: float = 1e-3
+    """Peak learning rate of Adam (Sec. IV-A)."""
+    warmup_steps: int = 100
+    """Steps of linear warm-up. Ours."""
+    decay: bool = True
+    """Whether a cosine decays the rate to zero. Ours."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, 1, "warmup_steps")
+        positive(self, "learning_rate")
+
+
+@dataclass(frozen=True)
+class VAEConfig(FitConfig):
     """Training of the VAE and its inverse model (stage 1a)."""
 
     latent_size: int = 64
@@ -24,10 +41,6 @@ class VAEConfig(Settings):
     frame only once."""
     learning_rate: float = 2e-3
     """Peak learning rate of Adam. Ours: 1e-4 in Sec. IV-A, too low for so few steps."""
-    warmup_steps: int = 100
-    """Steps of linear warm-up. Ours."""
-    decay: bool = True
-    """Whether a cosine decays the rate to zero. Ours."""
     steps: int = 4_000
     """Gradient steps. Ours: not given in the paper."""
     bfloat16: bool = False
@@ -42,8 +55,7 @@ class VAEConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(self, 1, "latent_size", "batch_size", "warmup_steps", "steps")
-        positive(self, "learning_rate")
+        at_least(self, 1, "latent_size", "batch_size", "steps")
         at_least(self, 0, "reconstruction_weight", "kl_weight", "inverse_weight")
         at_least(self, 2, "window")
         divides = self.batch_size % self.window == 0
@@ -51,30 +63,23 @@ class VAEConfig(Settings):
 
 
 @dataclass(frozen=True)
-class SequenceAutoencoderConfig(Settings):
+class SequenceAutoencoderConfig(FitConfig):
     """Training of the LSTM autoencoder on latent sequences (stage 1b)."""
 
     embedding_size: int = 32
     """LSTM units of encoder and decoder, hence dimensions of phi (Sec. IV-A)."""
     batch_size: int = 256
     """Sequences per step (Sec. IV-A)."""
-    learning_rate: float = 1e-3
-    """Peak learning rate of Adam (Sec. IV-A)."""
-    warmup_steps: int = 100
-    """Steps of linear warm-up. Ours."""
-    decay: bool = True
-    """Whether a cosine decays the rate to zero. Ours."""
     steps: int = 5_000
     """Gradient steps. Ours: not given in the paper."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(self, 1, "embedding_size", "batch_size", "warmup_steps", "steps")
-        positive(self, "learning_rate")
+        at_least(self, 1, "embedding_size", "batch_size", "steps")
 
 
 @dataclass(frozen=True)
-class InverseModelConfig(Settings):
+class InverseModelConfig(FitConfig):
     """Training of the inverse model on the latents of play (stage 1c). Ours."""
 
     hidden_size: int = 512
@@ -87,18 +92,13 @@ class InverseModelConfig(Settings):
     """Windows per step."""
     learning_rate: float = 2e-3
     """Peak learning rate of Adam."""
-    warmup_steps: int = 100
-    """Steps of linear warm-up."""
-    decay: bool = True
-    """Whether a cosine decays the rate to zero."""
     steps: int = 6_000
     """Gradient steps; 0 for no inverse model, hence a bank without steps of demonstrations."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(self, 1, "hidden_size", "batch_size", "warmup_steps")
+        at_least(self, 1, "hidden_size", "batch_size")
         at_least(self, 0, "steps")
-        positive(self, "learning_rate")
         if self.largest_action is not None:
             positive(self, "largest_action")
         at_least(self, 0, "noise")

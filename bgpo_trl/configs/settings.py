@@ -23,54 +23,51 @@ class Settings:
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self))
         for field in fields(self):  # pyright: ignore[reportArgumentType]
-            name, hint, value = field.name, hints[field.name], getattr(self, field.name)
-            need = _description(hint)
-            if not need:
-                raise ValueError(
-                    f"{name} is annotated as {hint}, which config.json cannot hold: annotate it as "
-                    "a number, a string, a bool, a dataclass, a tuple of one of them "
-                    "(tuple[int, ...]), or one or None"
-                )
+            hint, value = hints[field.name], getattr(self, field.name)
             try:
-                object.__setattr__(self, name, _plain(hint, value))
+                object.__setattr__(self, field.name, _plain(hint, value))
             except TypeError:
-                raise ValueError(f"{name} must be {need}, got {value}") from None
-
-
-def _description(hint: Any) -> str:
-    """Return what values of a type are, in words; "" for a type that files do not hold."""
-    kinds = get_args(hint)
-    if get_origin(hint) is Literal:
-        return " or ".join(map(str, kinds))
-    if len(kinds) == 2 and type(None) in kinds:
-        inner = _description(kinds[0])
-        return inner and f"{inner}, or None"
-    if get_origin(hint) is tuple and kinds[1:] == (...,):
-        inner = _description(kinds[0])
-        return inner and f"a tuple, each {inner}"
-    if is_dataclass(hint):
-        return f"of the class {hint.__name__}"  # pyright: ignore[reportAttributeAccessIssue]
-    return _NAMES.get(hint, "")
+                need = _NAMES.get(hint) or (hint.__name__ if isinstance(hint, type) else str(hint))
+                options = get_args(hint) if get_origin(hint) is Literal else ()
+                need = " or ".join(map(str, options)) or need
+                raise ValueError(f"{field.name} must be {need}, got {value}") from None
+            except NotImplementedError:
+                raise ValueError(
+                    f"{field.name} is annotated as {hint}, which config.json cannot hold: annotate "
+                    "it as a number, a string, a bool, a dataclass, a tuple of one of them "
+                    "(tuple[int, ...]), or one or None"
+                ) from None
 
 
 def _plain(hint: Any, value: Any) -> Any:
-    """Return a value as its annotated type; raise ``TypeError`` if it is of another."""
+    """Return a value as its annotated type.
+
+    Raises:
+        TypeError: If it is of another.
+        NotImplementedError: If files do not hold such a type.
+    """
     if hasattr(value, "tolist"):  # of NumPy or PyTorch
         value = value.tolist()
     kinds = get_args(hint)
-    if get_origin(hint) is Literal and value in kinds:
-        return value
-    if type(None) in kinds and get_origin(hint) is not Literal:
+    if get_origin(hint) is Literal:
+        found = value in kinds
+    elif len(kinds) == 2 and kinds[1] is type(None):
         return None if value is None else _plain(kinds[0], value)
-    if get_origin(hint) is tuple and isinstance(value, list | tuple | range):
-        return tuple(_plain(kinds[0], item) for item in value)
-    if hint is bool or isinstance(value, bool):
-        if hint is bool and isinstance(value, bool):
-            return value
-    elif hint is int and isinstance(value, Integral):
-        return int(value)
-    elif hint is float and isinstance(value, Real):
-        return float(value)
-    elif (hint is str and isinstance(value, str)) or (is_dataclass(hint) and is_dataclass(value)):
-        return value
-    raise TypeError
+    elif get_origin(hint) is tuple and kinds[1:] == (...,):
+        if isinstance(value, list | tuple | range):
+            return tuple(_plain(kinds[0], item) for item in value)
+        found = False
+    elif hint is int or hint is float:
+        number: Any = Integral if hint is int else Real
+        if isinstance(value, number) and not isinstance(value, bool):
+            return hint(value)
+        found = False
+    elif hint is bool or hint is str:
+        found = isinstance(value, hint)
+    elif is_dataclass(hint):
+        found = is_dataclass(value)
+    else:
+        raise NotImplementedError
+    if not found:
+        raise TypeError
+    return value

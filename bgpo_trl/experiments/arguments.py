@@ -47,7 +47,7 @@ class BankArguments(ImportArguments):
 class Arguments(BankArguments):
     """Train an algorithm to the end, test it and draw the figures.
 
-    Writes a run directory: config.json, train.csv, eval.csv, final.csv, gwr.csv, cost.csv,
+    Writes a run directory: config.json, train.csv, eval.csv, final.csv, cost.csv,
     summary.json, checkpoint/ and figures/, among them success.png (success on each task against
     training episodes), gwr.png (nodes of GWR-B in behavior space, Fig. 7) and groups.png.
 
@@ -88,13 +88,9 @@ class Arguments(BankArguments):
     train_encoders: bool = False
     """Record demonstrations and train new encoders instead of using the pretrained ones."""
     wandb: Literal["online", "offline"] | None = None
-    """Also log means over the seeds to Weights & Biases."""
-    wandb_group: str | None = None
-    """Group of the run on Weights & Biases; EXPERIMENT-ALGORITHM by default."""
+    """Also log means over the seeds to Weights & Biases, in the group EXPERIMENT-ALGORITHM."""
     tensorboard: bool = False
     """Also log these means to TensorBoard, into the run directory."""
-    per_seed_curves: bool = False
-    """Log the test success of each seed to them, too."""
     device: str = "auto"
     """Device of the networks: cpu, cuda, or auto for a GPU if there is one."""
     threads: int = 1
@@ -248,11 +244,11 @@ class ReportArguments:
     """Write tables and figures of runs: those in a folder, or single ones, of any algorithms.
 
     Prints and writes tables.md: success, differences between algorithms, forgetting and transfer,
-    learning times, groups of behaviors, cost, each run task by task, and the paper's claims as far
-    as there are runs for them; beside it, figures. Runs that differ in their seeds alone, such as
-    the jobs of a cluster, are reported as one. The report of a single run is written into its
-    directory. With --archive, first copies what reports read of the runs, compressed, and writes
-    the report beside the copies. docs/benchmark.md defines the measures.
+    learning times, groups of behaviors, cost, and each run task by task; beside it, figures. Runs
+    that differ in their seeds alone, such as the jobs of a cluster, are reported as one. The report
+    of a single run is written into its directory. With --archive, first copies what reports read of
+    the runs, compressed, and writes the report beside the copies. docs/benchmark.md defines the
+    measures.
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
@@ -261,12 +257,6 @@ class ReportArguments:
     """Folder of the report; by default that of the runs."""
     archive: Path | None = None
     """Folder for compact copies of the runs, on which the report is then made."""
-    anyway: bool = False
-    """Compare also runs under different conditions, such as other encoders or tests."""
-    compare: bool = False
-    """Only print the differences between two runs, task by task."""
-    every: int | None = None
-    """With --compare, also over each part of training of so many episodes."""
 
 
 @dataclass(frozen=True)
@@ -276,7 +266,7 @@ class WatchArguments(ImportArguments):
     Writes film.gif, and its frames as a strip film.png, into the run's figures/: for each task the
     demonstration, the policy's observations and a view of the robot, framed green on success and
     red on timeout. NICO starts from the same scene in every task, so only the demonstration makes
-    the difference. If the run saved graphs, also writes gwr_growth.png, the growth of GWR-B.
+    the difference.
     """
 
     run: tyro.conf.Positional[Path]

@@ -32,10 +32,9 @@ def command_line(
 ) -> None:
     """Call a function with the arguments of the command line, and print what it returns.
 
-    An expected error becomes one line. Control characters, which names in files of others may hold
-    and a terminal would act on, are printed as escapes. Ctrl-C and SIGTERM exit with 75
-    (``os.EX_TEMPFAIL``) if ``--resume`` can continue. An error of somebody else's code, such as a
-    module named with ``--import``, keeps its traceback.
+    An expected error becomes one line. Ctrl-C and SIGTERM exit with 75 (``os.EX_TEMPFAIL``) if
+    ``--resume`` can continue. An error of somebody else's code, such as a module named with
+    ``--import``, keeps its traceback.
 
     Args:
         command: Function of one dataclass, ``arguments``.
@@ -52,14 +51,14 @@ def command_line(
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         if _is_of_others(error):
             raise
-        sys.exit(f"error: {_printable(str(error))}")
+        sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         if not resumable:
             sys.exit("interrupted")
         sys.stderr.write("interrupted: the same command with --resume continues\n")
         sys.exit(os.EX_TEMPFAIL)
     if text is not None:
-        sys.stdout.write("\n".join(map(_printable, text.split("\n"))) + "\n")
+        sys.stdout.write(f"{text}\n")
 
 
 @contextlib.contextmanager
@@ -74,11 +73,6 @@ def _terminable() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-
-def _printable(line: str) -> str:
-    """Return a line with escape sequences of Python for all that is not printable."""
-    return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in line)
 
 
 def _parse(kind: type, options: Sequence[str] | None, program: str | None, line: str) -> Any:

@@ -85,11 +85,7 @@ def form(
 
 
 def groups(arguments: GroupsArguments) -> str:
-    """Measure the groups of behaviors that form from demonstrations, as `GroupsArguments` says.
-
-    Raises:
-        ValueError: If there is nothing to draw, or a bank or task does not exist.
-    """
+    """Measure the groups of behaviors that form from demonstrations, as `GroupsArguments` says."""
     torch.set_num_threads(1)
     check_draws(arguments.seeds, arguments.draws)
     bank, config = bank_of(arguments), BGPOConfig()

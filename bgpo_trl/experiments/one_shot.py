@@ -11,12 +11,7 @@ from bgpo_trl.scenes import find_scene
 
 
 def one_shot(arguments: OneShotArguments) -> str:
-    """Show a policy a demonstration; return what it recognizes and, if asked for, achieves.
-
-    Raises:
-        ValueError: If the run or the demonstration cannot be read, or a task to play is unknown or
-            has no simulation.
-    """
+    """Show a policy a demonstration; return what it recognizes and, if asked for, achieves."""
     import_plugin(arguments.module)
     policy = load_run(arguments.run, seed=arguments.run_seed)
     film = read_film(arguments.demonstration)

@@ -21,26 +21,25 @@ from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.experiments.arguments import Arguments, BankArguments
 from bgpo_trl.experiments.measure import draw, measure
 from bgpo_trl.experiments.settings import (
-    as_begun,
     changed_hyperparameters,
     chosen_scene,
     chosen_tasks,
-    is_finished,
     named_directory,
 )
 from bgpo_trl.files.writing import lock_directory, write_json
 from bgpo_trl.machine import choose_device, keep_freed_memory, set_threads
 from bgpo_trl.plugins import import_plugin
-from bgpo_trl.runs.config_file import read_config
+from bgpo_trl.runs.config_file import Digests, read_config
 from bgpo_trl.runs.dashboard import tensorboard_logger, wandb_logger
-from bgpo_trl.runs.demonstrations import BANK, load_inputs, own_weights
+from bgpo_trl.runs.demonstrations import load_inputs, own_weights
 from bgpo_trl.runs.directory import holds_run
-from bgpo_trl.runs.growth import Distinctness, Grown, add_task, distinctness
+from bgpo_trl.runs.growth import Grown, add_task, distinctness
 from bgpo_trl.runs.provenance import command, commit_of_code, versions
+from bgpo_trl.runs.results import read_json
 from bgpo_trl.scenes import Scene, find_scene
 from bgpo_trl.training import Trainer
 
-_DATASET, _ENCODERS = "demonstrations", "encoders"  # folders of a run that trains its encoders
+_DATASET = "demonstrations"  # folder of a run that trains its encoders
 
 
 def run_experiment(
@@ -53,25 +52,74 @@ def run_experiment(
 
     In addition to the files of `Trainer`, the run directory gets ``final.csv`` (success and steps
     of the trained policies with demonstrations seen in training and with held-out ones, and task
-    inference), ``gwr.csv`` (nodes of the first seed's GWR-B), ``figures/`` (including a video of a
-    test episode of each task; also on dashboards) and finally ``summary.json`` (commit,
-    versions of packages, changed hyperparameters, command, success of a random policy, nodes of
-    GWR-B, groups of behaviors).
-
-    Args:
-        arguments: Arguments of the command line.
-        name: Name of the experiment, for the run directory.
-        config: Settings of the run.
-        make: Factory of the algorithm; by default the one registered as ``config.name``.
-
-    Returns:
-        Results to print, with the path of the run directory.
+    inference), ``figures/`` (including a video of a test episode of each task) and finally
+    ``summary.json`` (commit, versions of packages, changed hyperparameters, command, success of a
+    random policy, nodes of GWR-B, groups of behaviors).
 
     Raises:
         ValueError: If the directory holds another run, or no run to resume; or if ``bank`` or
             ``encoders`` are given although encoders are yet to be trained.
         BlockingIOError: If another process is using the directory.
     """
+    _check(arguments, config)
+    commit = commit_of_code()  # read first, since commits may follow during training
+    set_threads(arguments.threads)
+    keep_freed_memory()
+    device = choose_device(arguments.device)
+    size = arguments.preset or (arguments.config.stem if arguments.config else "quick")
+    group = f"{name}-{config.name}"
+    out = named_directory(arguments) or Path("runs") / f"{group}-{size}"
+    begun: tuple[RunConfig, Digests] | None = None
+    grown: Grown | None = None
+    verdict = ""
+    if not arguments.resume and holds_run(out):
+        raise ValueError(f"{out} holds a run: --resume continues it, --out names another directory")
+    if arguments.resume and (out / "config.json").exists():
+        begun = read_config(out / "config.json")
+        config = _continued(arguments, config, begun[0])
+        if arguments.add_task is None and _is_finished(out, config, begun[0]):
+            return f"{out} is finished, all {config.episodes} episodes: --episodes makes it longer"
+    if arguments.add_task is not None:
+        grown = add_task(out, arguments.add_task, config=config, bank=arguments.bank)
+        config, seen = grown.config, distinctness(grown.bank)
+        verdict = f"{arguments.add_task}: {seen}"
+        if not seen.clear:
+            warnings.warn(verdict, stacklevel=2)
+    loggers: list[Callable[[], Logger]] = []
+    if arguments.wandb is not None:
+        loggers.append(partial(wandb_logger, out, arguments.wandb, group))
+    if arguments.tensorboard:
+        loggers.append(partial(tensorboard_logger, out))
+    with lock_directory(out):
+        if grown is None:
+            encoders, bank = _inputs(arguments, config, out, device, begun)
+        else:
+            encoders, bank = grown.encoders, grown.bank
+        with Trainer(
+            config,
+            out,
+            bank=bank,
+            encoders=encoders,
+            make=make,
+            device=device,
+            resume=arguments.resume,
+            loggers=loggers,
+        ) as trainer:
+            trainer.run()
+            code = {"commit": commit, "versions": versions()}
+            changed = changed_hyperparameters(config)
+            summary = {**code, "changed": changed, **measure(trainer, bank, out)}
+            lines = draw(trainer, bank, out, summary)
+            # Written last, as the mark of a complete run.
+            write_json(out / "summary.json", summary)
+    lines += [verdict] if verdict else []
+    return "\n".join(
+        [*lines, f"curve and figures: {out}; in numbers: bgpo report {quote(str(out))}"]
+    )
+
+
+def _check(arguments: Arguments, config: RunConfig) -> None:
+    """Raise ``ValueError`` for arguments that do not go together."""
     if arguments.train_encoders and (arguments.bank or arguments.encoders):
         raise ValueError(
             "--bank and --encoders name what is there: leave them or --train-encoders out"
@@ -88,120 +136,53 @@ def run_experiment(
             "--add-task: name a run with --resume and --out, without --encoders and "
             "--train-encoders, since it keeps its own"
         )
-    commit = commit_of_code()  # read first, since commits may follow during training
-    set_threads(arguments.threads)
-    keep_freed_memory()
-    device = choose_device(arguments.device)
-    size = arguments.preset or (arguments.config.stem if arguments.config else "quick")
-    group = f"{name}-{config.name}"
-    out = named_directory(arguments) or Path("runs") / f"{group}-{size}"
-    grown: Grown | None = None
-    seen: Distinctness | None = None
-    loggers = _loggers(arguments, config, out, group, size)
-    if arguments.resume:
-        config = _continued(arguments, config, out)
-        if arguments.add_task is not None:
-            grown = add_task(out, arguments.add_task, config=config, bank=arguments.bank)
-            config, seen = grown.config, distinctness(grown.bank)
-            if not seen.clear:
-                warnings.warn(f"{arguments.add_task}: {seen}", stacklevel=2)
-        elif is_finished(out, config):
-            return f"{out} is finished, all {config.episodes} episodes: --episodes makes it longer"
-    elif holds_run(out):
-        raise ValueError(f"{out} holds a run: --resume continues it, --out names another directory")
-    with lock_directory(out):
-        if grown is None:
-            encoders, bank = _encoders(arguments, config, out, device)
-        else:
-            encoders, bank = grown.encoders, grown.bank
-        with Trainer(
-            config,
-            out,
-            bank=bank,
-            encoders=encoders,
-            make=make,
-            device=device,
-            resume=arguments.resume,
-            loggers=loggers,
-            per_seed_curves=arguments.per_seed_curves,
-        ) as trainer:
-            trainer.run()
-            code = {"commit": commit, "versions": versions()}
-            changed = changed_hyperparameters(config)
-            summary = {**code, "changed": changed, **measure(trainer, bank, out)}
-            lines = draw(trainer, bank, out, summary)
-            for path in sorted((out / "figures").iterdir()):
-                trainer.dashboard.log_media(f"figures/{path.stem}", path)
-            # Written last, as the mark of a complete run.
-            write_json(out / "summary.json", summary)
-    if seen is not None:
-        lines.append(f"{arguments.add_task}: {seen}")
-    lines.append(f"curve and figures: {out}; in numbers: bgpo report {quote(str(out))}")
-    return "\n".join(lines)
 
 
-def _loggers(
-    arguments: Arguments, config: RunConfig, out: Path, group: str, size: str
-) -> list[Callable[[], Logger]]:
-    """Return functions that make the loggers of the command line."""
-    loggers: list[Callable[[], Logger]] = []
-    if arguments.wandb is not None:
-        # Without --preset or --config, the size of a run that is resumed is its own.
-        sized = arguments.preset or arguments.config or not holds_run(out)
-        tags = (config.name, config.schedule, size) if sized else None
-        group = arguments.wandb_group or group
-        loggers.append(partial(wandb_logger, out, arguments.wandb, group=group, tags=tags))
-    if arguments.tensorboard:
-        loggers.append(partial(tensorboard_logger, out))
-    return loggers
+def _continued(arguments: Arguments, config: RunConfig, saved: RunConfig) -> RunConfig:
+    """Return the settings with which a run continues: its task starts and evaluation interval.
 
-
-def _bank(arguments: Arguments, out: Path) -> Path | None:
-    """Return the bank of the command line or, when resuming, that of the run directory."""
-    kept = out / BANK
-    return kept if arguments.bank is None and arguments.resume and kept.exists() else arguments.bank
-
-
-def _makes_encoders(arguments: Arguments, out: Path) -> bool:
-    # A bank fits the encoders that embedded it alone.
-    given = arguments.encoders is not None or _bank(arguments, out) is not None
-    return arguments.train_encoders or (arguments.preset in STAGE_PRESETS and not given)
-
-
-def _continued(arguments: Arguments, config: RunConfig, out: Path) -> RunConfig:
-    """Return the settings with which the run in a directory continues, or begins.
-
-    Raises:
-        ValueError: If the directory holds the beginning of new encoders that are not asked for.
+    Both depend on the length of a run by default, and flags set them.
     """
-    begun = any((out / folder).exists() for folder in (_DATASET, _ENCODERS))
-    if begun and not holds_run(out) and not _makes_encoders(arguments, out):
-        raise ValueError(
-            f"{out} holds the beginning of new encoders: add --train-encoders, or name another "
-            "directory"
-        )
-    continued = as_begun(config, out, keep_eval_every=arguments.gives("eval_every"))
-    if arguments.gives("task_starts"):  # the run's, or `Trainer` refuses them
-        continued = replace(continued, task_starts=config.task_starts)
-    return continued
+    from_start = [[start == 0 for start in run.task_starts] for run in (saved, config)]
+    if from_start[0] != from_start[1]:  # another experiment, which `Trainer` refuses
+        return config
+    kept = ("task_starts", "eval_every")
+    own = {name: getattr(saved, name) for name in kept if not arguments.gives(name)}
+    return replace(config, **own)
 
 
-def _encoders(
-    arguments: Arguments, config: RunConfig, out: Path, device: torch.device
+def _is_finished(out: Path, config: RunConfig, saved: RunConfig) -> bool:
+    """Return whether a directory holds a complete run: training, final tests and figures."""
+    if saved != config or not all((out / name).exists() for name in ("final.csv", "summary.json")):
+        return False
+    return read_json(out / "summary.json").get("episodes") == config.episodes
+
+
+def _inputs(
+    arguments: Arguments,
+    config: RunConfig,
+    out: Path,
+    device: torch.device,
+    begun: tuple[RunConfig, Digests] | None,
 ) -> tuple[Representation, DemonstrationBank]:
     """Return the pretrained encoders and a bank, or new ones made in the run directory."""
-    begun = arguments.resume and arguments.bank is None and (out / "config.json").exists()
-    scene, own = find_scene(config.scene), own_weights(out)
-    if begun:
-        return load_inputs(out, config.tasks, read_config(out / "config.json")[1], scene)
-    if not _makes_encoders(arguments, out):
-        bank = _bank(arguments, out)
+    scene, bank = find_scene(config.scene), arguments.bank
+    if begun is not None and bank is None:
+        return load_inputs(out, config.tasks, begun[1], scene)
+    # A bank fits only the encoders that embedded it.
+    given = arguments.encoders is not None or bank is not None
+    if not (arguments.train_encoders or (arguments.preset in STAGE_PRESETS and not given)):
+        if arguments.resume and not holds_run(out) and (out / _DATASET).exists():
+            raise ValueError(
+                f"{out} holds the beginning of new encoders: add --train-encoders, or name another "
+                "directory"
+            )
         return pretrained_for(config.tasks, bank, scene=scene, weights=arguments.encoders)
     stage = STAGE_PRESETS.get(arguments.preset or "")
-    encoders, bank = make_pretrained(
-        own,
+    encoders, made = make_pretrained(
+        own_weights(out),
         out / _DATASET,
-        folder=out / _ENCODERS,
+        folder=out / "encoders",
         command=command(),
         device=device,
         tasks=config.tasks,
@@ -209,7 +190,7 @@ def _encoders(
         scene=scene,
         **({} if stage is None else vars(stage)),
     )
-    return encoders, bank.for_tasks(config.tasks)
+    return encoders, made.for_tasks(config.tasks)
 
 
 def pretrained_for(
@@ -244,11 +225,7 @@ def pretrained_for(
 
 
 def bank_of(arguments: BankArguments) -> DemonstrationBank:
-    """Load the demonstrations that a command line names, embedded by trained encoders.
-
-    Raises:
-        ValueError: As for `import_plugin`, `chosen_scene`, `chosen_tasks` and `pretrained_for`.
-    """
+    """Load the demonstrations that a command line names, embedded by trained encoders."""
     import_plugin(arguments.module)
     scene = chosen_scene(arguments.scene)
     tasks = chosen_tasks(arguments.tasks, scene)

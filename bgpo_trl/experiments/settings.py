@@ -16,7 +16,6 @@ from bgpo_trl.experiments.arguments import SETTINGS, Arguments
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.config_file import read_config, read_settings
 from bgpo_trl.runs.directory import differing_settings
-from bgpo_trl.runs.results import read_json
 from bgpo_trl.scenes import Scene, find_scene
 
 _Entry = TypeVar("_Entry")
@@ -28,11 +27,6 @@ def run_config(
     """Return the settings that a command line asks for.
 
     Imports the module of own tasks and algorithms first.
-
-    Args:
-        arguments: The command line.
-        from_start: Whether all tasks are presented from the start.
-        changes: Settings to change, as by flags; those that are None are left.
 
     Raises:
         ValueError: If the settings are invalid, or a file, task or algorithm does not exist.
@@ -136,22 +130,14 @@ def chosen(entries: Mapping[str, _Entry], name: str, flag: str) -> _Entry:
 
 
 def chosen_scene(name: str | None, default: str = "nico") -> Scene:
-    """Return the scene that ``--scene`` names.
-
-    Raises:
-        ValueError: If it does not exist.
-    """
+    """Return the scene that ``--scene`` names."""
     return find_scene(default if name is None else name)
 
 
 def chosen_tasks(
     tasks: tuple[str, ...] | None, scene: Scene, default: tuple[str, ...] | None = None
 ) -> tuple[str, ...]:
-    """Return the tasks of a scene that ``--tasks`` names, by default its usual ones.
-
-    Raises:
-        ValueError: If it is empty or a task does not exist.
-    """
+    """Return the tasks of a scene that ``--tasks`` names, by default its usual ones."""
     if tasks is None:
         return scene.default_tasks if default is None else default
     if tasks == ("all",):
@@ -181,25 +167,6 @@ def check_draws(seeds: Sequence[int], draws: int) -> None:
     check_seeds(seeds)
 
 
-def as_begun(config: RunConfig, directory: Path, *, keep_eval_every: bool = False) -> RunConfig:
-    """Return a run with the task starts and evaluation interval of the shorter run in a directory.
-
-    Args:
-        config: The run; both settings depend on its length by default.
-        directory: The run directory.
-        keep_eval_every: Whether to keep the evaluation interval of ``config``.
-    """
-    try:
-        saved, _ = read_config(directory / "config.json")
-    except ValueError:  # reported by the next reader of the file
-        return config
-    from_start = [[start == 0 for start in run.task_starts] for run in (saved, config)]
-    if from_start[0] != from_start[1]:  # another experiment
-        return config
-    every = config.eval_every if keep_eval_every else saved.eval_every
-    return replace(config, task_starts=saved.task_starts, eval_every=every)
-
-
 def changed_hyperparameters(config: RunConfig) -> dict[str, Any]:
     """Return the hyperparameters of a run that are not the usual ones of its algorithm, by name."""
     if config.name not in ALGORITHMS:
@@ -210,14 +177,3 @@ def changed_hyperparameters(config: RunConfig) -> dict[str, Any]:
         usual = _in_scene(replace(config, algorithm=usual), scene).algorithm
     different = differing_settings(asdict(usual), asdict(config.algorithm))
     return {name: value for name, _, value in different}
-
-
-def is_finished(directory: Path, config: RunConfig) -> bool:
-    """Return whether a directory holds a complete run: training, final tests and figures."""
-    try:
-        saved, _ = read_config(directory / "config.json")
-        summary = read_json(directory / "summary.json")
-    except ValueError:
-        return False
-    tested = (directory / "final.csv").exists()
-    return tested and saved == config and summary.get("episodes") == config.episodes

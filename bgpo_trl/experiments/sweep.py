@@ -18,7 +18,7 @@ import socket
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,13 +26,13 @@ from typing import Any
 from bgpo_trl.algorithms import ABLATIONS
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.experiments.arguments import Arguments, Setting, SweepArguments
-from bgpo_trl.experiments.run import pretrained_for, run_experiment
+from bgpo_trl.experiments.run import run_experiment
 from bgpo_trl.experiments.settings import run_config
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.writing import lock_directory
 from bgpo_trl.plugins import import_plugin
-from bgpo_trl.runs.config_file import Digests, settings_of
-from bgpo_trl.runs.directory import check_settings, holds_run
+from bgpo_trl.runs.config_file import read_config
+from bgpo_trl.runs.directory import holds_run
 from bgpo_trl.scenes import find_scene
 from suites import opengl
 
@@ -42,21 +42,17 @@ RETRIES = 10
 
 @dataclass(frozen=True, eq=False)  # Own hyperparameters may not be hashable.
 class Job:
-    """A run of a block of seeds, and its directory.
+    """A run of a block of seeds.
 
     Attributes:
         directory: Directory of the run.
         config: The run.
-        module: Module that adds its tasks or algorithm, see `bgpo_trl.plugins.import_plugin`.
-        bank: Demonstrations of tasks that are not the paper's.
-        encoders: Encoders that do not come with the scene.
+        arguments: Its module of tasks or algorithms, its bank and encoders.
     """
 
     directory: Path
     config: RunConfig
-    module: str | None = None
-    bank: Path | None = None
-    encoders: Path | None = None
+    arguments: Arguments = Arguments()  # noqa: RUF009, it is frozen
 
     def __str__(self) -> str:
         return f"{self.directory.parent.name}/{self.directory.name}"
@@ -66,43 +62,45 @@ class Job:
         """Whether the job was run to its end, of which the summary is the mark."""
         return (self.directory / "summary.json").exists()
 
+    @property
+    def episodes(self) -> int:
+        """The number of training episodes on record."""
+        path = self.directory / "train.csv"
+        return path.read_bytes().count(b"\n") - 1 if path.exists() else 0
 
-def make_jobs(arguments: SweepArguments) -> dict[Path, list[Job]]:
-    """Return the jobs of the grid, by the folder of their directories.
+
+def make_jobs(arguments: SweepArguments) -> list[Job]:
+    """Return the jobs of the grid.
 
     Raises:
-        ValueError: If the settings are invalid, or the grid is empty.
+        ValueError: If the settings are invalid, the grid is empty, or the directory of a job holds
+            a run with other settings.
     """
-    if arguments.block < 1:
-        raise ValueError(f"block must be at least 1, got {arguments.block}")
-    if arguments.cpus_per_run <= 0 or arguments.gpus_per_run < 0:
-        raise ValueError("--cpus-per-run must be above 0 and --gpus-per-run at least 0")
+    if arguments.block < 1 or arguments.cpus_per_run <= 0 or arguments.gpus_per_run < 0:
+        raise ValueError(
+            "--block must be at least 1, --cpus-per-run above 0 and --gpus-per-run at least 0"
+        )
     ablation = [name for name in ABLATIONS if not name.startswith("bgpo")]
-    jobs: dict[Path, list[Job]] = {}
-    for setting in arguments.settings:
-        for name in ablation if setting == "ablation" else arguments.algorithms:
-            config = _config(arguments, setting, name)
-            folder = arguments.out.absolute() / f"{setting}-{name}"
-            blocks = [
-                config.seeds[first : first + arguments.block]
-                for first in range(0, len(config.seeds), arguments.block)
-            ]
-            bank, encoders = (
-                None if path is None else path.absolute()
-                for path in (arguments.bank, arguments.encoders)
-            )
-            jobs[folder] = [
-                Job(
-                    folder / "-".join(["seeds", *map(str, block)]),
-                    replace(config, seeds=block),
-                    module=arguments.module,
-                    bank=bank,
-                    encoders=encoders,
-                )
-                for block in blocks
-            ]
-    if not jobs:
+    of_runs = {
+        f"{setting}-{name}": _config(arguments, setting, name)
+        for setting in arguments.settings
+        for name in (ablation if setting == "ablation" else arguments.algorithms)
+    }
+    if not of_runs:
         raise ValueError("name at least one of --algorithms and one of --settings")
+    bank, encoders = (
+        None if path is None else path.absolute() for path in (arguments.bank, arguments.encoders)
+    )
+    files = Arguments(module=arguments.module, bank=bank, encoders=encoders)
+    jobs: list[Job] = []
+    for folder, config in of_runs.items():
+        for first in range(0, len(config.seeds), arguments.block):
+            block = config.seeds[first : first + arguments.block]
+            directory = arguments.out.absolute() / folder / "-".join(["seeds", *map(str, block)])
+            jobs.append(Job(directory, replace(config, seeds=block), files))
+            path = directory / "config.json"
+            if path.exists() and read_config(path)[0] != jobs[-1].config:
+                raise ValueError(f"{directory} holds a run with other settings: name another --out")
     return jobs
 
 
@@ -134,49 +132,16 @@ def _config(arguments: SweepArguments, setting: Setting, name: str) -> RunConfig
     )
 
 
-def check_directories(
-    jobs: dict[Path, list[Job]], digests: Mapping[tuple[str, ...], Digests]
-) -> None:
-    """Check that the directories of the jobs hold no other runs.
-
-    Args:
-        jobs: Result of `make_jobs`.
-        digests: Digests of the encoders and demonstrations, by the tasks of a job.
-
-    Raises:
-        ValueError: If a directory holds another run.
-    """
-    for folder, group in jobs.items():
-        if (folder / "config.json").exists():
-            raise ValueError(f"{folder} is not a run of a sweep: choose another --out")
-        for job in group:
-            check_settings(job.directory, settings_of(job.config, digests[job.config.tasks]))
-
-
-def _digests(job: Job) -> Digests:
-    """Return the digests of the encoders and demonstrations of a job."""
-    config = job.config
-    found = pretrained_for(config.tasks, job.bank, scene=config.scene, weights=job.encoders)
-    return Digests(*(part.identity for part in found))
-
-
 def play(job: Job) -> None:
     """Play a job to its end, from its last checkpoint if there is one."""
-    import_plugin(job.module)
-    arguments = Arguments(
-        out=job.directory, resume=holds_run(job.directory), bank=job.bank, encoders=job.encoders
-    )
-    run_experiment(arguments, "sweep", job.config)
+    import_plugin(job.arguments.module)
+    resume = holds_run(job.directory)
+    run_experiment(replace(job.arguments, out=job.directory, resume=resume), "sweep", job.config)
 
 
 @contextlib.contextmanager
 def connected(address: str, cpus: float, gpus: float) -> Iterator[None]:
     """Connect to a Ray cluster, or start Ray on this machine, for the duration of the block.
-
-    Args:
-        address: Address of the cluster, or ``"local"``.
-        cpus: Cores per job.
-        gpus: GPUs per job.
 
     Raises:
         ValueError: If this machine is too small for a job.
@@ -209,10 +174,7 @@ def connected(address: str, cpus: float, gpus: float) -> Iterator[None]:
 def work(job: Job, play: Callable[[Job], None], command: Sequence[str]) -> None:
     """Run a job in a worker unless it is finished, with its output in the job's ``log.txt``.
 
-    Args:
-        job: The job.
-        play: Function that runs it.
-        command: Value for ``sys.argv``, which Ray sets otherwise in a worker.
+    ``command`` is the value for ``sys.argv``, which Ray sets otherwise in a worker.
     """
     sys.argv = list(command)
     with (
@@ -236,11 +198,7 @@ def play_jobs(
 ) -> dict[Job, str]:
     """Run jobs on the connected Ray cluster, with a progress bar.
 
-    Args:
-        jobs: The jobs.
-        play: Function called in a worker, which resumes a job and returns at its end.
-        cpus: Cores per job.
-        gpus: GPUs per job.
+    ``play`` is called in a worker; it resumes a job and returns at its end.
 
     Returns:
         The failed jobs, each with a one-line reason: ``play`` raised, or its worker was lost
@@ -254,8 +212,7 @@ def play_jobs(
 
     # Workers import modules beside `play`, from this package and, of own tasks, from here.
     folders = [Path(inspect.getfile(play)).resolve().parent, Path(__file__).resolve().parents[2]]
-    folders.append(Path.cwd())
-    path = [*map(str, folders), os.environ.get("PYTHONPATH", "")]
+    path = [*map(str, [*folders, Path.cwd()]), os.environ.get("PYTHONPATH", "")]
     environment = {"PYTHONPATH": os.pathsep.join(filter(None, path)), "OMP_NUM_THREADS": "1"}
     task = ray.remote(
         num_cpus=cpus,
@@ -267,7 +224,8 @@ def play_jobs(
     pending = {task.remote(job, play, sys.argv): job for job in jobs}
     failed: dict[Job, str] = {}
     total = sum(len(job.config.seeds) * job.config.episodes for job in jobs)
-    with progress_bar("sweep", total=total, initial=_episodes(jobs), unit="episode") as bar:
+    played = sum(job.episodes for job in jobs)
+    with progress_bar("sweep", total=total, initial=played, unit="episode") as bar:
         try:
             while pending:
                 for ended in ray.wait(list(pending), timeout=10)[0]:
@@ -275,9 +233,11 @@ def play_jobs(
                     try:
                         ray.get(ended)
                     except RayError as error:
-                        failed[job] = _reason(error)
+                        cause = getattr(error, "cause", None) or error
+                        reason = (str(cause).splitlines() or [""])[0]
+                        failed[job] = f"{type(cause).__name__}: {reason}"
                     bar.write(f"{job}: {'failed' if job in failed else 'finished'}")
-                bar.update(_episodes(jobs) - bar.n)
+                bar.update(sum(job.episodes for job in jobs) - bar.n)
         except KeyboardInterrupt:
             for reference in pending:
                 ray.cancel(reference)
@@ -286,38 +246,21 @@ def play_jobs(
     return failed
 
 
-def _episodes(jobs: Iterable[Job]) -> int:
-    """Return the number of training episodes on record."""
-    files = (job.directory / "train.csv" for job in jobs)
-    return sum(path.read_bytes().count(b"\n") - 1 for path in files if path.exists())
-
-
-def _reason(error: Exception) -> str:
-    cause = getattr(error, "cause", None) or error
-    return f"{type(cause).__name__}: {(str(cause).splitlines() or [''])[0]}"
-
-
 def sweep(arguments: SweepArguments) -> str:
-    """Run the jobs of a grid that are not finished.
-
-    Raises:
-        ValueError: If the settings are invalid, or a directory holds another run.
-        RuntimeError: If a job fails, such as on a full disk, after the others have finished.
-    """
+    """Run the jobs of a grid that are not finished."""
     import_plugin(arguments.module)
     jobs = make_jobs(arguments)
-    check_directories(jobs, {g[0].config.tasks: _digests(g[0]) for g in jobs.values()})
-    todo = [job for group in jobs.values() for job in group if not job.finished]
+    todo = [job for job in jobs if not job.finished]
     failed: dict[Job, str] = {}
     if todo:
         if arguments.address == "local":  # The machines of a cluster are not this one.
             opengl.check()
-        resources = {"cpus": arguments.cpus_per_run, "gpus": arguments.gpus_per_run}
+        cpus, gpus = arguments.cpus_per_run, arguments.gpus_per_run
         try:
-            with connected(arguments.address, **resources):
-                failed = play_jobs(todo, play, **resources)
+            with connected(arguments.address, cpus, gpus):
+                failed = play_jobs(todo, play, cpus=cpus, gpus=gpus)
         except KeyboardInterrupt:
             sys.exit("interrupted: the same command continues")
     if failed:
         raise RuntimeError("; ".join(f"{job} failed: {why}" for job, why in failed.items()))
-    return f"jobs: {sum(map(len, jobs.values()))}, run: {len(todo)}; bgpo report {arguments.out}"
+    return f"jobs: {len(jobs)}, run: {len(todo)}; bgpo report {arguments.out}"

@@ -1,4 +1,4 @@
-"""Jobs on a Ray of this machine, and on two machines of which one is lost."""
+"""Jobs on a Ray of this machine."""
 
 import os
 import signal
@@ -6,7 +6,6 @@ import sys
 import tempfile
 import threading
 import time
-from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -16,11 +15,7 @@ from bgpo_trl.experiments import sweep as jobs
 from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.experiments.sweep import Job
-from bgpo_trl.training import Trainer
 from tests.helpers import rows
-
-# Otherwise Ray starts a worker on every core, in vain.
-SMALL = {"include_dashboard": False, "object_store_memory": 80_000_000}
 
 
 @pytest.fixture(scope="module")
@@ -160,67 +155,3 @@ def test_a_missing_ray_names_the_extra_to_install(monkeypatch):
 
     with pytest.raises(SystemExit, match=r"^error: [^\n]*pip install 'bgpo_trl\[ray\]'$"):
         command_line(sweep, [])
-
-
-@pytest.fixture
-def cluster(folder):
-    """Makes a cluster of a machine that only leads and two that play; yields it and those two."""
-    import ray
-    from ray.cluster_utils import Cluster
-
-    settings = {"health_check_initial_delay_ms": 0, "health_check_failure_threshold": 3}
-    settings["health_check_period_ms"] = 1_000
-    ray.shutdown()  # the one of other tests
-    made = Cluster()
-    try:
-        made.add_node(num_cpus=0, _system_config=settings, **SMALL)
-        yield made, [made.add_node(num_cpus=1, **SMALL) for _ in range(2)]
-    finally:
-        ray.shutdown()
-        made.shutdown()
-
-
-@pytest.mark.slow
-def test_jobs_of_a_lost_machine_continue_identically_elsewhere(
-    cluster, bank, make_config, tmp_path
-):
-    """It is lost half-way through its run, and the other machine plays what is left."""
-    config = make_config(state="state", name="ddpg", episodes=40, checkpoint_minutes=0.0)
-    todo = [
-        Job(tmp_path / f"seeds-{a}-{b}", replace(config, seeds=(a, b)))
-        for a, b in ((3, 8), (1, 2), (5, 4))
-    ]
-
-    def play(job):
-        import ray
-
-        with (job.directory / "node").open("a") as file:
-            file.write(f"{ray.get_runtime_context().get_node_id()}\n")
-        Trainer(job.config, job.directory, bank=bank, resume=True, progress=False).run()
-
-    made, machines = cluster
-    lost = []
-
-    def lose():
-        """Takes the machine away that has played a third of the first job."""
-        path = todo[0].directory / "train.csv"
-        while not path.exists() or path.read_text().count("\n") < 27:
-            time.sleep(0.05)
-        node = (todo[0].directory / "node").read_text().strip()
-        (machine,) = (machine for machine in machines if machine.node_id == node)
-        made.remove_node(machine, allow_graceful=False)
-        lost.append(node)
-
-    with jobs.connected(made.address, 1, 0):
-        thread = threading.Thread(target=lose, daemon=True)
-        thread.start()
-        assert jobs.play_jobs(todo, play) == {}
-        thread.join(60)
-    first, second = (todo[0].directory / "node").read_text().split()
-    assert first == lost[0] != second
-    for job in todo:
-        reference = tmp_path / "reference" / job.directory.name
-        config = replace(job.config, checkpoint_minutes=10.0)
-        Trainer(config, reference, bank=bank, progress=False).run()
-        for name in ("train.csv", "eval.csv"):
-            assert (job.directory / name).read_bytes() == (reference / name).read_bytes()

@@ -103,4 +103,4 @@ def test_a_task_and_an_algorithm_of_a_module_are_trained_reported_filmed_and_tes
 
     one_shot(OneShotArguments(run=run, shares=(1.0,), episodes=2, module="mine_at_once"))
     table = read_table(run / "one_shot.csv")[["seed", "task", "success"]]
-    assert table.to_numpy().tolist() == [["3", "at_once", "1.0"], ["8", "at_once", "1.0"]]
+    assert table.to_numpy().tolist() == [[3, "at_once", 1.0], [8, "at_once", 1.0]]

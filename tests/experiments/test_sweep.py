@@ -10,7 +10,6 @@ from collections import Counter
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from types import SimpleNamespace
 
 import eight_tasks
 import pytest
@@ -19,7 +18,7 @@ from eight_tasks import EightTasksArguments
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import PRESETS
 from bgpo_trl.experiments import sweep
-from bgpo_trl.experiments.sweep import Job, SweepArguments
+from bgpo_trl.experiments.sweep import SweepArguments
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.results import joined, read_run, run_directories
 from suites import nico
@@ -27,7 +26,6 @@ from tests.helpers import contents
 
 ROOT = Path(__file__).parents[2]
 SOME = Digests("some", "bank")
-BY_TASKS = {nico.PAPER_TASKS: SOME}
 HEAD = "algorithm,seed,episode,env_steps,task,success,return,steps"
 # Two algorithms, two blocks of seeds.
 FEW = {"algorithms": ("bgpo", "maml"), "seeds": (4, 0, 2), "block": 2, "preset": "quick"}
@@ -53,26 +51,27 @@ def test_a_job_is_a_block_of_seeds_of_an_algorithm_in_a_setting(tmp_path):
         block=2,
         out=tmp_path,
     )
-    grid = sweep.make_jobs(arguments)
-    assert [merged.name for merged in grid] == [
+    grid = iter(sweep.make_jobs(arguments))
+    for merged in (
         *("continual-bgpo", "continual-dist-nll", "concurrent-bgpo", "concurrent-dist-nll"),
         *("ablation-without-bonus", "ablation-without-gwr", "ablation-without-both"),
         *("ablation-group-balanced-replay", "ablation-demonstrations"),
-    ]
-    for merged, group in grid.items():
-        setting, name = merged.name.split("-", 1)
+    ):
+        setting, name = merged.split("-", 1)
         starts = PRESETS["desk"].task_starts if setting == "continual" else (0, 0, 0)
         usual = replace(PRESETS["desk"], name=name, algorithm=ALGORITHMS[name].config)
-        for job, seeds in zip(group, [(0, 1), (2, 5), (9,)], strict=True):
+        for seeds in ((0, 1), (2, 5), (9,)):
+            job = next(grid)
             assert job.config == replace(usual, task_starts=starts, seeds=seeds)
-            assert job.directory == tmp_path / merged.name / "-".join(map(str, ("seeds", *seeds)))
+            assert job.directory == tmp_path / merged / "-".join(map(str, ("seeds", *seeds)))
+    assert not [*grid]
 
 
 def test_jobs_carry_tasks_module_and_bank(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     bank, tasks = Path("own.safetensors"), nico.PAPER_TASKS[:2]
     arguments = SweepArguments(settings=("continual",), tasks=tasks, module="my_tasks", bank=bank)
-    ((job,),) = sweep.make_jobs(arguments).values()
+    (job,) = sweep.make_jobs(arguments)
     assert (job.config.tasks, job.config.task_starts) == (tasks, (0, 3_000))
     events = []
 
@@ -97,12 +96,11 @@ def test_the_benchmark_of_eight_tasks_is_a_grid_with_tests_every_50_episodes(mon
     assert [arguments.eval_every for arguments in asked] == [50, 20]
     grid = sweep.make_jobs(asked[0])
     assert len(grid) == 3 * 8
-    for group in grid.values():
-        (job,) = group
+    for job in grid:
         assert job.config.seeds == (10, 11, 12, 13, 14)
         assert (job.config.held_out, len(job.config.tasks)) == ("test", 8)
     more = SweepArguments(settings=("eight-sequential", "sequential"), episodes=4_000)
-    config = {path.name: group[0].config for path, group in (grid | sweep.make_jobs(more)).items()}
+    config = {job.directory.parent.name: job.config for job in grid + sweep.make_jobs(more)}
     assert config["eight-bgpo"].task_starts == tuple(range(0, 4_000, 500))
     assert config["eight-concurrent-bgpo"].task_starts == (0,) * 8
     assert config["eight-reversed-bgpo"].tasks == nico.ALL_TASKS[::-1]
@@ -113,7 +111,7 @@ def test_the_benchmark_of_eight_tasks_is_a_grid_with_tests_every_50_episodes(mon
 @pytest.mark.parametrize(
     ("wrong", "cause"),
     [
-        ({"block": 0}, "block"),
+        ({"block": 0}, "--block"),
         ({"seeds": (1, 2, 1)}, "seeds"),
         ({"settings": ("eight",), "tasks": ("grasp_glass",)}, "--tasks"),
         ({"algorithms": ()}, "--algorithms"),
@@ -129,22 +127,12 @@ def test_wrong_grids_are_refused(tmp_path, wrong, cause):
 
 
 def test_directories_of_other_runs_are_refused(tmp_path):
-    grid = sweep.make_jobs(SweepArguments(out=tmp_path, **FEW))
-    sweep.check_directories(grid, BY_TASKS)  # there is nothing yet
-    for group in grid.values():
-        write_run(group[1])
-    sweep.check_directories(grid, BY_TASKS)
-    with pytest.raises(ValueError, match="encoders is some there and others here"):
-        sweep.check_directories(grid, {nico.PAPER_TASKS: Digests("others", "bank")})
-    longer = sweep.make_jobs(SweepArguments(out=tmp_path, episodes=7, **FEW))
-    with pytest.raises(ValueError, match=r"seeds-2 holds a run with other settings .*episodes is"):
-        sweep.check_directories(longer, BY_TASKS)
-
-    alone = sweep.make_jobs(SweepArguments(out=tmp_path / "alone", **FEW))
-    write_run(Job(tmp_path / "alone" / "concurrent-maml", alone.popitem()[1][0].config))
+    jobs = sweep.make_jobs(SweepArguments(out=tmp_path, **FEW))
+    write_run(jobs[1])
+    sweep.make_jobs(SweepArguments(out=tmp_path, **FEW))
     before = contents(tmp_path)
-    with pytest.raises(ValueError, match="concurrent-maml is not a run of a sweep"):
-        sweep.sweep(SweepArguments(out=tmp_path / "alone", **FEW))
+    with pytest.raises(ValueError, match="seeds-2 holds a run with other settings: name another"):
+        sweep.sweep(SweepArguments(out=tmp_path, episodes=7, **FEW))
     assert contents(tmp_path) == before
 
 
@@ -170,8 +158,6 @@ def test_a_sweep_runs_each_job_once(tmp_path, monkeypatch):
     monkeypatch.setattr(sweep, "connected", lambda *_, **__: contextlib.nullcontext())
     monkeypatch.setattr(sweep, "play_jobs", play_jobs)
     monkeypatch.setattr(sweep, "play", play)
-    some = [SimpleNamespace(identity=digest) for digest in SOME]
-    monkeypatch.setattr(sweep, "pretrained_for", lambda tasks, bank, **_: some)
 
     arguments = SweepArguments(out=tmp_path, episodes=4, **FEW)
     with pytest.raises(RuntimeError, match=f"^{broken[0]} failed: no space left$"):
