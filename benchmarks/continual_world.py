@@ -37,9 +37,9 @@ MODULE, SCENE = "examples.continual_world", "cw10"
 HELD_OUT = 10  # further demonstrations of each task, which test episodes show
 # Demonstrations come with their actions: no inverse model has to infer them.
 WITHOUT_INVERSE = InverseModelConfig(steps=0)
-ENCODERS = RepresentationConfig(vae=VAEConfig(bfloat16=True), inverse=WITHOUT_INVERSE)
+ENCODERS = RepresentationConfig(inverse=WITHOUT_INVERSE)
 SMALL_ENCODERS = RepresentationConfig(
-    vae=VAEConfig(steps=400, bfloat16=True),
+    vae=VAEConfig(steps=400),
     lae=SequenceAutoencoderConfig(steps=400, batch_size=64),
     inverse=WITHOUT_INVERSE,
 )

@@ -7,6 +7,7 @@ benchmark. The module draws the frames of all tasks: ``python -m examples.contin
 An episode has 50 actions of four simulation steps each, hence 200 steps as in Continual World. It
 succeeds if Meta-World reports success at any of these steps. Objects and goals are drawn anew for
 each episode. Goals are green balls: Meta-World's own marks are smaller than a pixel of our frames.
+Pucks are yellow and the wall is purple: Meta-World's are as dark as the table, and transparent.
 """
 
 from __future__ import annotations
@@ -39,23 +40,40 @@ CW10 = (
 )
 # Tasks whose goal the objects do not show.
 WITH_GOAL = ("push-wall", "push-back", "stick-pull", "push", "shelf-place")
+WITH_PUCK = ("push-wall", "push-back", "push")
 GOAL_RADIUS = 0.03  # m, a little more than a pixel
+GREEN, YELLOW, PURPLE = (0, 1, 0, 1), (1, 1, 0, 1), (0.5, 0.2, 0.7, 1)
 
 
-class GoalWorld(World):
-    """Meta-World's environment of a task, with a goal that is seen in frames."""
+class VisibleWorld(World):
+    """Meta-World's environment of a task, with goal, puck and wall that are seen in frames.
+
+    The fingers and the stick are thinner than a pixel. Drawn at one point of each pixel, they
+    would come and go as the arm moves.
+    """
+
+    samples = 4
 
     def __init__(self, task: str) -> None:
         super().__init__(task)
         if task in WITH_GOAL:
             goal = self.model.site("goal")
-            goal.size[:], goal.rgba[:] = GOAL_RADIUS, (0, 1, 0, 1)
+            goal.size[:], goal.rgba[:] = GOAL_RADIUS, GREEN
+        if task in WITH_PUCK:
+            self._paint("obj", YELLOW)
+        if task == "push-wall":
+            self._paint("wall", PURPLE)
+
+    def _paint(self, body: str, color: Sequence[float]) -> None:
+        """Color what is seen of a body; materials are dark, or nearly transparent."""
+        geom = self.model.geom(int(self.model.body(body).geomadr[0]))
+        geom.matid[:], geom.rgba[:] = -1, color
 
 
 class ContinualWorld(MetaWorld):
     """One arm and the objects of the current task, with Continual World's measure of success."""
 
-    make_world = GoalWorld
+    make_world = VisibleWorld
 
     def step(self, action: NDArray[np.float64]) -> Outcome:
         """Perform an action: the hand's velocity along x, y and z, and closing of the gripper."""
@@ -77,6 +95,7 @@ def make_env(tasks: Sequence[str], **arguments: Any) -> SimulationEnv:
 SCENES["cw10"] = replace(
     METAWORLD,
     name="cw10",
+    version=METAWORLD.version.replace("1-", "2-", 1),  # 1: dark pucks, one point of a pixel
     tasks=CW10,
     default_tasks=CW10,
     make_env=make_env,

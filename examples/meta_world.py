@@ -50,7 +50,12 @@ class World:
     """Meta-World's environment of a task, which all simulations of the task enter in turn.
 
     Most of its memory is the model. A simulation has data and attributes of its own.
+
+    Attributes:
+        samples: Points drawn of each pixel, as for `simplified`.
     """
+
+    samples: int = 0
 
     def __init__(self, task: str) -> None:
         self.env: SawyerXYZEnv = ALL_V3_ENVIRONMENTS[f"{task}-v3"]()
@@ -80,7 +85,7 @@ class World:
     @cached_property
     def camera(self) -> TwoCameras:
         """The cameras, with an OpenGL context each."""
-        return TwoCameras(self.model)
+        return TwoCameras(self.model, self.samples)
 
 
 class MetaWorld(Simulation):

@@ -29,14 +29,18 @@ def place_cameras(model: mujoco.MjModel) -> None:
         camera.quat = turn.as_quat(scalar_first=True)
 
 
-def simplified(model: mujoco.MjModel) -> mujoco.MjModel:
+def simplified(model: mujoco.MjModel, samples: int = 0) -> mujoco.MjModel:
     """Return a copy to draw, without shadows and mirrors, and with simple hulls for large meshes.
 
     A frame takes a hundredth of the time.
+
+    Args:
+        model: The model.
+        samples: Points of each pixel that are drawn and averaged; 0 for its middle alone.
     """
     model = copy(model)
     model.light_castshadow[:] = model.mat_reflectance[:] = 0
-    model.vis.quality.offsamples = model.vis.quality.shadowsize = 0
+    model.vis.quality.shadowsize, model.vis.quality.offsamples = 0, samples
     directions = np.random.default_rng(0).standard_normal((_DIRECTIONS, 3))
     for mesh in np.flatnonzero(model.mesh_facenum > _MANY_FACES):
         first, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
@@ -58,10 +62,11 @@ class TwoCameras:
 
     Args:
         model: A model whose cameras are in their places.
+        samples: As for `simplified`.
     """
 
-    def __init__(self, model: mujoco.MjModel) -> None:
-        model, (height, width) = simplified(model), FRAME_SHAPE
+    def __init__(self, model: mujoco.MjModel, samples: int = 0) -> None:
+        model, (height, width) = simplified(model, samples), FRAME_SHAPE
         self.renderers = [
             FrameRenderer(model, camera, height=height, width=width // 2) for camera in _CAMERAS
         ]

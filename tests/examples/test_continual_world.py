@@ -7,7 +7,7 @@ from bgpo_trl.scenes import find_scene
 
 pytest.importorskip("metaworld", reason="Meta-World is not installed (docs/extending.md)")
 
-from examples.continual_world import CW10, WITH_GOAL, ContinualWorld
+from examples.continual_world import CW10, WITH_GOAL, WITH_PUCK, ContinualWorld
 
 pytestmark = pytest.mark.slow
 
@@ -41,6 +41,15 @@ def test_a_goal_is_seen_and_drawn_anew(worlds, task):
     for red, green, blue in (frame.transpose(2, 0, 1) for frame in frames):
         assert (green > 100 + np.maximum(red, blue)).sum() >= 2
     assert not np.array_equal(*goals)
+
+
+@pytest.mark.parametrize("task", WITH_PUCK)
+def test_a_puck_is_seen_in_both_views_and_a_wall_where_there_is_one(worlds, task):
+    red, green, blue = begin(worlds, task).frame().astype(int).transpose(2, 0, 1)
+    yellow = np.minimum(red, green) > 60 + blue
+    assert all(view.any() for view in np.hsplit(yellow, 2))
+    purple = blue > 40 + green
+    assert purple.any() == (task == "push-wall")
 
 
 def test_success_at_any_simulation_step_ends_the_episode(worlds, monkeypatch):
