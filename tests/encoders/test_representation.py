@@ -2,7 +2,7 @@
 
 import csv
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -175,13 +175,15 @@ def test_the_inverse_model_alone_is_trained_as_with_the_other_encoders(tmp_path:
     play, more = squares(10), squares(14)
     trained = train(squares(8), play=play, command="first")
     assert same(trained, retrain_inverse(trained, play, TINY, progress=False))
-    with_more = retrain_inverse(trained, more, TINY, command="then", progress=False)
-    assert not same(trained, with_more)
+    wider = replace(TINY, inverse=replace(TINY.inverse, hidden_size=16))
+    with_more = retrain_inverse(trained, more, wider, command="then", progress=False)
     assert same(trained, replace(with_more, inverse=trained.inverse))
-    assert with_more.metadata == {**trained.metadata, "command": "first; then"}
+    config = {**json.loads(trained.metadata["config"]), "inverse": asdict(wider.inverse)}
+    changes = {"command": "first; then", "config": json.dumps(config)}
+    assert with_more.metadata == {**trained.metadata, **changes}
 
     weights = tmp_path / "weights.safetensors"
-    again = partial(train_encoders, squares(8), weights=weights, config=TINY, keep=trained)
+    again = partial(train_encoders, squares(8), weights=weights, config=wider, keep=trained)
     written, _ = again(more, folder=tmp_path / "more")
     assert same(written, with_more) and same(load_representation(weights), with_more)
     with pytest.raises(ValueError, match="give the folder of recorded play"):
@@ -232,6 +234,15 @@ def test_actions_that_the_inverse_model_would_never_see_are_refused_before_train
         play = with_a_gripper(8)
         train(squares(8).exclude("action"), limited, play=play, log=log.append)
     assert not log
+
+
+def test_actions_beyond_the_largest_teach_the_inverse_model_nothing(tiny: Representation) -> None:
+    limited = replace(TINY, inverse=replace(TINY.inverse, largest_action=0.6))
+    play = squares(10)
+    turned, large = play.clone(), play["action"].abs().amax(-1, keepdim=True) > 0.6
+    turned["action"] = torch.where(large, -play["action"], play["action"])
+    first, second = (retrain_inverse(tiny, p, limited, progress=False) for p in (play, turned))
+    assert same(first, second)
 
 
 def test_actions_of_any_size_are_learned_from_and_recorded_ones_are_used(tmp_path: Path) -> None:
