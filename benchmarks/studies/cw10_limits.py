@@ -1,0 +1,221 @@
+"""Continual World's ten tasks: what limits a clone of 30 demonstrations, and which groups form.
+
+A clone of each task imitates its demonstrations, told the task, and is tested from 20 new starts.
+It observes Meta-World's ground truth of 39 numbers, or the first 64 principal components of the
+frames of all tasks, which take seconds instead of the VAE's hours. Groups form from embeddings of
+sequences of these components.
+
+    python benchmarks/studies/cw10_limits.py truth
+    python benchmarks/studies/cw10_limits.py frames --folder runs/cw10/demonstrations
+    python benchmarks/studies/cw10_limits.py groups --folder runs/cw10/demonstrations
+
+The folder is that of `benchmarks/continual_world.py`; demonstrations are recorded if missing.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+import tyro
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from bgpo_trl.analysis.task_inference import group_purity
+from bgpo_trl.configs import BGPOConfig
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders.representation import valid_frames, valid_steps
+from bgpo_trl.experiments.groups import draw, form
+from bgpo_trl.experiments.settings import even_starts
+from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
+from bgpo_trl.objectives.supervised import sequence_reconstruction_loss
+from bgpo_trl.transforms import TaskSchedule
+from examples.continual_world import CW10, ContinualWorld
+from examples.meta_world import demonstrator
+
+SHOWN, HELD_OUT, TESTS, MAX_STEPS = 30, 10, 20, 50
+COMPONENTS, NOISE, LIMIT, LEAST = 64, 0.2, 5.0, 0.1
+DRAWS, SEEDS = 600, (0, 1, 2)
+
+Observe = Callable[[ContinualWorld], Tensor]
+
+
+def perform(
+    simulation: ContinualWorld, act: Callable[[], np.ndarray], observe: Observe
+) -> tuple[list[Tensor], list[np.ndarray], bool]:
+    """Act to the end of an episode; return observations and actions, and whether it succeeded."""
+    seen, actions = [], []
+    for _ in range(MAX_STEPS):
+        seen.append(observe(simulation))
+        actions.append(act())
+        if simulation.step(actions[-1]).success:
+            return seen, actions, True
+    return seen, actions, False
+
+
+def truth(simulation: ContinualWorld) -> Tensor:
+    """Return Meta-World's ground truth, ``[39]``."""
+    return torch.tensor(simulation.observation).float()
+
+
+def demonstrate(task: str) -> tuple[Tensor, Tensor]:
+    """Repeat the demonstrations of a recording; return ground truth and actions of its steps."""
+    simulation, seen, actions = ContinualWorld({}), [], []
+    for row in range(SHOWN):
+        sequence = np.random.SeedSequence([0, CW10.index(task) * (SHOWN + HELD_OUT) + row])
+        success = False
+        while not success:
+            start, noise = (int(child.generate_state(1)[0]) for child in sequence.spawn(2))
+            simulation.seed(start)
+            simulation.reset(task)
+            act = demonstrator(simulation, task, noise)
+            states, done, success = perform(simulation, act, truth)
+        seen += states
+        actions += done
+    return torch.stack(seen), torch.from_numpy(np.array(actions)).float()
+
+
+def components(dataset: TensorDictBase) -> Callable[[Tensor], Tensor]:
+    """Return the map from frames uint8 ``[..., H, W, 3]`` to scaled components ``[..., 64]``."""
+    shown = (valid_frames(dataset[dataset["train"]]).float() / 255).flatten(1)
+    mean = shown.mean(0)
+    torch.manual_seed(0)
+    directions = torch.svd_lowrank(shown - mean, q=COMPONENTS, niter=3)[2]
+    scale = ((shown - mean) @ directions).std(0)
+    scale = scale.clamp_min(LEAST * scale.max())
+
+    def encode(pixels: Tensor) -> Tensor:
+        return ((pixels.float() / 255).flatten(-3) - mean) @ directions / scale
+
+    return encode
+
+
+def clone(seen: Tensor, actions: Tensor) -> nn.Sequential:
+    """Train a policy on the observations and actions ``[N, ...]`` of demonstrations."""
+    torch.manual_seed(0)
+    size = seen.shape[-1]
+    hidden = nn.Linear(size, 128), nn.ReLU(), nn.Linear(128, 128), nn.ReLU()
+    policy = nn.Sequential(*hidden, nn.Linear(128, 4), nn.Tanh())
+    optimizer = torch.optim.Adam(policy.parameters(), 1e-3)
+    for _ in range(3_000):
+        rows = torch.randint(len(seen), (128,))
+        noisy = seen[rows] + NOISE * torch.randn(128, size)
+        loss = (policy(noisy) - actions[rows]).square().sum(-1).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    return policy.requires_grad_(False)
+
+
+def success(task: str, policy: nn.Module, observe: Observe) -> float:
+    """Return the share of new starts from which a policy succeeds."""
+    simulation = ContinualWorld({})
+    simulation.seed(12_345)
+    won = 0
+    for _ in range(TESTS):
+        simulation.reset(task)
+        act = lambda: policy(observe(simulation)).double().numpy()  # noqa: E731
+        won += perform(simulation, act, observe)[2]
+    return won / TESTS
+
+
+def clone_of_truth(task: str) -> float:
+    """Return the success of a clone that observes the ground truth."""
+    seen, actions = demonstrate(task)
+    mean, scale = seen.mean(0), seen.std(0)
+    scale = scale.clamp_min(LEAST * scale[scale > 0].median())
+    policy = clone((seen - mean) / scale, actions)
+    return success(task, policy, lambda simulation: (truth(simulation) - mean) / scale)
+
+
+def clone_of_frames(
+    task: str, dataset: TensorDictBase, encode: Callable[[Tensor], Tensor]
+) -> float:
+    """Return the success of a clone that observes frames."""
+    rows = (dataset["task"] == CW10.index(task)) & dataset["train"]
+    valid = valid_steps(dataset["length"] - 1, dataset["action"].shape[1])[rows]
+    seen = encode(dataset["pixels"][rows][:, :-1][valid]).clamp(-LIMIT, LIMIT)
+    policy = clone(seen, dataset["action"][rows][valid])
+
+    def observe(simulation: ContinualWorld) -> Tensor:
+        return encode(torch.from_numpy(simulation.frame())).clamp(-LIMIT, LIMIT)
+
+    return success(task, policy, observe)
+
+
+def embed(dataset: TensorDictBase, encode: Callable[[Tensor], Tensor], seed: int) -> Tensor:
+    """Return the embedding of each demonstration, ``[N, 32]``."""
+    length, train = dataset["length"], dataset["train"]
+    valid = valid_steps(length, dataset["pixels"].shape[1])
+    latent = torch.where(valid[..., None], encode(dataset["pixels"]), 0.0)
+    torch.manual_seed(seed)
+    lae = SequenceAutoencoder(COMPONENTS)
+    optimizer = torch.optim.Adam(lae.parameters(), 1e-3)
+    sequences, lengths = latent[train], length[train]
+    for _ in range(400):
+        rows = torch.randint(len(sequences), (64,))
+        batch = TensorDict({"latent": sequences[rows], "length": lengths[rows]}, [64])
+        optimizer.zero_grad()
+        sequence_reconstruction_loss(lae, batch)["loss_reconstruction"].backward()
+        optimizer.step()
+    with torch.no_grad():
+        return lae.encode(latent, length)
+
+
+def print_groups(dataset: TensorDictBase, encode: Callable[[Tensor], Tensor]) -> None:
+    """Print groups and purity, by order of the tasks and seed of embedding and draws."""
+    starts, n_tasks = even_starts(len(CW10), DRAWS), len(CW10)
+    schedules = {
+        "one after the other": TaskSchedule(starts),
+        "the newest only": TaskSchedule(starts, cumulative=False),
+        "from the start": TaskSchedule((0,) * n_tasks),
+    }
+    for seed in SEEDS:
+        embedding = embed(dataset, encode, seed)
+        bank = DemonstrationBank(embedding, dataset["task"], dataset["train"], CW10)
+        for order, schedule in schedules.items():
+            rows = [*draw(bank.seen(), schedule, DRAWS, seed)]
+            groups, _, _ = form(bank.seen(), rows, BGPOConfig())
+            purity = 100 * group_purity(groups, bank.held_out(), n_tasks)
+            print(seed, order, len(groups.numbers), f"{purity:.0f} %", flush=True)
+
+
+def main(
+    what: tyro.conf.Positional[Literal["truth", "frames", "groups"]],
+    folder: Path = Path("runs/cw10/demonstrations"),
+    tasks: tuple[str, ...] = CW10,
+) -> None:
+    """Measure what limits clones and groups.
+
+    Args:
+        what: What clones observe, or groups.
+        folder: Folder of the demonstrations.
+        tasks: Tasks to clone.
+    """
+    torch.set_num_threads(1)
+    if what == "truth":
+        for task in tasks:
+            print(task, clone_of_truth(task), flush=True)
+        return
+    recorded = record_demonstrations(
+        folder, scene="cw10", per_task=SHOWN + HELD_OUT, held_out_per_task=HELD_OUT
+    )
+    dataset = recorded.clone()
+    encode = components(dataset)
+    if what == "groups":
+        print_groups(dataset, encode)
+        return
+    for task in tasks:
+        print(task, clone_of_frames(task, dataset, encode), flush=True)
+
+
+if __name__ == "__main__":
+    try:
+        tyro.cli(main, description=__doc__)
+    except (ValueError, OSError, RuntimeError) as error:
+        sys.exit(f"error: {error}")
