@@ -85,6 +85,14 @@ def test_an_invalid_cell_is_refused(tmp_path, name, valid, wrong):
             read_table(path)
 
 
+def test_rows_that_are_all_longer_than_the_head_are_refused(tmp_path):
+    """Pandas would drop their last cells."""
+    path = tmp_path / "cost.csv"
+    path.write_text(",".join(COLUMNS["cost.csv"]) + "\n1,2,3,4,5\n1,2,3,4,5\n")
+    with pytest.raises(ValueError, match=r"cost\.csv is damaged"):
+        read_table(path)
+
+
 def test_what_only_some_runs_have_may_be_missing(tmp_path):
     path = tmp_path / "final.csv"
     path.write_text("seed,demonstrations,task,success\n0,seen,a,0.5\n")
