@@ -16,6 +16,8 @@ import tyro
 
 # Checkpoints of `--preset quick` take 0.2 GB; of 10 seeds and 20,000 episodes 9 GB.
 _ROOM = 0.5e9
+# Below, a run of --preset quick takes an hour for its frames alone.
+_SLOW = 30
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,11 @@ def check_scene(arguments: DoctorArguments) -> str:
     if not changed:
         raise RuntimeError(
             f"{seen}: try MUJOCO_GL=egl or osmesa; of an own scene, check camera and actions"
+        )
+    if rate < _SLOW:
+        return (
+            f"{seen}; this is slow: without a GPU, shadows and antialiasing cost most, of an own "
+            "scene switch them off (docs/extending.md, Your robot)"
         )
     return seen
 

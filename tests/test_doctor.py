@@ -55,8 +55,10 @@ class Blind(Dot):
         return np.zeros((16, 24, 3), np.uint8)
 
 
-@pytest.mark.parametrize(("make", "level"), [(Dot, "ok"), (Blind, "wrong")])
-def test_a_robot_is_drawn_and_measured(tmp_path, monkeypatch, capsys, make, level):
+@pytest.mark.parametrize(("make", "level", "slow"), [(Dot, "ok", 1e9), (Blind, "wrong", 0)])
+def test_a_robot_is_drawn_and_measured(tmp_path, monkeypatch, capsys, make, level, slow):
+    """Frames that take long are no fault, but there is a hint."""
+    monkeypatch.setattr(doctor, "_SLOW", slow)
     monkeypatch.setitem(SCENES, "dot", scene(make))
     try:
         doctor.doctor(DoctorArguments(frame=tmp_path / "dot.png", scene="dot"))
@@ -67,6 +69,7 @@ def test_a_robot_is_drawn_and_measured(tmp_path, monkeypatch, capsys, make, leve
     assert found["dot"][0] == level
     assert "16 x 24, " in found["dot"][1]
     assert float(re.findall(r"(\d+) frames a second", found["dot"][1])[0]) > 0
+    assert ("shadows" in found["dot"][1]) == (slow > 0)
     assert Image.open(tmp_path / "dot.png").size == (8 * 24, 8 * 16)
 
 

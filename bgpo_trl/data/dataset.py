@@ -379,6 +379,6 @@ def _check_pixels(pixels: NDArray[Any], least: int) -> None:
     shape = pixels.shape
     if pixels.dtype != np.uint8 or len(shape) != 4 or shape[-1] != 3 or shape[0] < least:
         raise ValueError(
-            f"has pixels {pixels.dtype} {[*shape]}: give uint8 [T, H, W, 3] (0 to 255), at least "
-            f"{least} frames"
+            f"has pixels {pixels.dtype} {[*shape]}: give uint8 [T, H, W, 3] (0 to 255)"
+            + (f", at least {least} frames" if least else "")
         )
