@@ -141,7 +141,7 @@ def train_representation(
     """
     config = config or RepresentationConfig()
     train, _ = split(dataset)
-    seen = [train] if play is None else [train, split(play, "the recorded play")[0]]
+    seen = [train] if play is None else [train, training_part(play, "the recorded play")]
     own = seen[-1]
     _check_actions(train, own, config.inverse)
     fit = Fit(config, **how)
@@ -184,7 +184,7 @@ def retrain_inverse(
     `train_representation`; play without actions is refused, too.
     """
     fit = Fit(config or RepresentationConfig(), **how)
-    own, _ = split(play, "the recorded play")
+    own = training_part(play, "the recorded play")
     if "action" not in own:
         raise ValueError("the inverse model learns from actions, which this play lacks: record it")
     _check_actions(None, own, fit.config.inverse)
@@ -350,12 +350,27 @@ def split(
         ValueError: If either set is empty.
     """
     chosen = dataset.get("train").bool()
-    if chosen.all() or not chosen.any():
+    if chosen.all():
         raise ValueError(
-            f"{name} needs episodes to train on and held-out ones (key 'train'): record it with "
-            "held_out_per_task of at least 1 and less than per_task"
+            f"{name} has no held-out episodes (key 'train'): record or write it with "
+            "held_out_per_task of at least 1"
         )
-    return dataset[chosen], dataset[~chosen]  # pyright: ignore[reportReturnType]
+    return training_part(dataset, name), dataset[~chosen]  # pyright: ignore[reportReturnType]
+
+
+def training_part(dataset: TensorDictBase, name: str) -> TensorDictBase:
+    """Return the training episodes, by the key ``train``; ``name`` is for errors.
+
+    Raises:
+        ValueError: If there are none.
+    """
+    chosen = dataset.get("train").bool()
+    if not chosen.any():
+        raise ValueError(
+            f"{name} has no episodes to train on (key 'train'): record or write it with a "
+            "held_out_per_task below the number of episodes of each task"
+        )
+    return dataset[chosen]  # pyright: ignore[reportReturnType]
 
 
 def valid_steps(length: Tensor, steps: int) -> Tensor:

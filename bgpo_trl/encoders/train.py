@@ -23,6 +23,7 @@ from bgpo_trl.encoders.representation import (
     Representation,
     retrain_inverse,
     save_representation,
+    split,
     train_representation,
 )
 from bgpo_trl.files.csv_file import CsvFile
@@ -68,13 +69,16 @@ def train_encoders(
         scene: The robot, or its name.
 
     Raises:
-        ValueError: As `train_representation`; if there are encoders to keep, but no play.
+        ValueError: As `train_representation`; if there are encoders to keep, but no play; or if
+            there is ground truth to probe held-out play with, and no such play.
         OSError: If a file cannot be written.
     """
     if keep is not None and play is None:
         raise ValueError("to train the inverse model alone, give the folder of recorded play")
     scene = find_scene(scene)
     tasks = scene.default_tasks if tasks is None else tasks
+    if play is not None and keep is None and scene.state is not None and "state" in play:
+        split(play, "the recorded play")  # before hours of training, at whose end it is probed
     if config.inverse.largest_action is None:
         inverse = replace(config.inverse, largest_action=scene.largest_action)
         config = replace(config, inverse=inverse)

@@ -161,6 +161,21 @@ def test_weights_depend_on_seed_and_training_part_and_not_on_global_state(
     assert not same(tiny, train(data, replace(TINY, seed=1)))
 
 
+def test_play_is_held_out_only_where_it_is_probed(tmp_path: Path) -> None:
+    play, blind = squares(10), replace(NICO, state=None)
+    play["train"] = torch.ones(10, dtype=torch.bool)
+    arguments = (squares(8), play, tmp_path / "weights.safetensors", tmp_path / "run", TINY)
+    with pytest.raises(ValueError, match=r"recorded play has no held-out .* held_out_per_task of"):
+        train_encoders(*arguments)
+    assert not [*tmp_path.iterdir()]  # nothing was trained before
+    trained, _ = train_encoders(*arguments, scene=blind)
+    together = torch.cat([valid_frames(squares(8)[squares(8)["train"]]), valid_frames(play)])
+    torch.testing.assert_close(trained.frame_network.mean_frame, mean_frame(together))
+    play["train"] = torch.zeros(10, dtype=torch.bool)
+    with pytest.raises(ValueError, match="recorded play has no episodes to train on"):
+        train(squares(8), play=play)
+
+
 def test_the_frame_encoder_learns_from_the_training_part_of_play(tiny: Representation) -> None:
     play = squares(10)
     trained, held_out_changed = train(squares(8), play=play), play.clone()
