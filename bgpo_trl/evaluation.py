@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from bgpo_trl.algorithms import Algorithm
-from bgpo_trl.algorithms.algorithm import Policy
+from bgpo_trl.algorithms.algorithm import Policy, read_joints
 from bgpo_trl.algorithms.environments import observation_env
 from bgpo_trl.configs import AlgorithmConfig
 from bgpo_trl.data.bank import DemonstrationBank
@@ -88,7 +88,7 @@ class Evaluator:
     ) -> None:
         scene = find_scene(scene)
         self.max_steps = config.max_steps
-        self._state_key = config.state
+        self._state_key = config.observed
         self.seeds, self.schedule = tuple(seeds), schedule
         n_tasks = schedule.n_tasks
         self.shape = (len(seeds), n_tasks, episodes)
@@ -106,7 +106,8 @@ class Evaluator:
             spread=spread,
             observation="pixels" if config.state == "latent" else "state",
         )
-        self.env = observation_env(config, self.simulation, encoders, scene.state)
+        joints = read_joints(config, scene)
+        self.env = observation_env(config, self.simulation, encoders, scene.state, joints)
         self._task = torch.arange(n_tasks)[:, None].expand(self.shape).contiguous()
         self._next = 0
         self._waiting: list[list[Snapshot]] = [[] for _ in seeds]

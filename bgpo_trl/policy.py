@@ -22,7 +22,7 @@ from torchrl.envs import Compose
 
 from bgpo_trl.algorithms import Algorithm, entry
 from bgpo_trl.algorithms.algorithm import Policy
-from bgpo_trl.algorithms.environments import clip, encode
+from bgpo_trl.algorithms.environments import beside_joints, clip, encode
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.dataset import resize_frames
@@ -132,7 +132,9 @@ class TrainedPolicy:
         self._index = run.config.seeds.index(seed)
         self.episodes = run.episodes[self._index]
         config = run.config.algorithm
-        self._observe = Compose([encode(config, run.encoders), *clip(config)])
+        self._joints = run.algorithm.joints
+        observe = [encode(config, run.encoders), *beside_joints(self._joints), *clip(config)]
+        self._observe = Compose(observe)
         self._policy: Policy | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -193,25 +195,44 @@ class TrainedPolicy:
         return Recognition(embedding, **recognized, task=task)
 
     @torch.no_grad()
-    def act(self, frame: ArrayLike) -> NDArray[np.float32]:
+    def act(self, frame: ArrayLike, joints: ArrayLike | None = None) -> NDArray[np.float32]:
         """Return the action for a frame, float32 ``[A]`` in [-1, 1].
 
         Args:
             frame: uint8 ``[H, W, 3]``.
+            joints: Readings of the robot's joints at that time ``[J]``, in the unit of the scene's,
+                for a policy that reads them (`BGPOConfig.joints`); None for any other.
 
         Raises:
-            ValueError: If the frame has another dtype or shape, or no demonstration was given
-                before.
+            ValueError: If the frame has another dtype or shape, no demonstration was given before,
+                or joints are missing, not read, or not finite numbers.
         """
         if self._policy is None:
             raise ValueError("the policy has seen no demonstration: show it one with condition()")
         seen = self._frames(frame, "a frame is uint8 [{}]", 3)
-        return self._action(seen).cpu().numpy()
+        return self._action(seen, *self._readings(joints)).cpu().numpy()
 
-    def _action(self, frame: Tensor) -> Tensor:
-        """Return the action for a frame uint8 ``[H, W, 3]``, on the device of the policy."""
+    def _readings(self, joints: ArrayLike | None) -> list[Tensor]:
+        """Return the joints, float32 ``[J]``, if the policy reads them, else nothing."""
+        if self._joints is None:
+            if joints is not None:
+                raise ValueError("this policy reads no joints: give it frames alone")
+            return []
+        readings, size = np.asarray(joints), self._joints.size
+        kind = readings.dtype.kind
+        if kind not in "fiu" or readings.shape != (size,) or not np.isfinite(readings).all():
+            found = "nothing" if joints is None else f"{readings.dtype} {[*readings.shape]}"
+            raise ValueError(
+                f"this policy reads {size} joints, finite numbers, beside the frame, got {found}: "
+                "act(frame, joints)"
+            )
+        return [torch.tensor(readings, dtype=torch.float32)]
+
+    def _action(self, frame: Tensor, joints: Tensor | None = None) -> Tensor:
+        """Return the action for a frame and joints, on the device of the policy."""
         assert self._policy is not None
-        state = self._observe(TensorDict({"pixels": frame}))[self.config.algorithm.state]
+        seen = {"pixels": frame} if joints is None else {"pixels": frame, "joints": joints}
+        state = self._observe(TensorDict(seen))[self.config.algorithm.observed]
         return self._policy.act(state.to(self.algorithm.device))
 
     def preprocess(
@@ -255,7 +276,8 @@ class TrainedPolicy:
 
         It maps a frame uint8 ``[H, W, 3]`` to an action float32 ``[A]`` in [-1, 1], with frame
         encoder, clipping and context inside: ``torch.export.load(path).module()(frame)``, or
-        ``onnxruntime.InferenceSession(path).run(None, {"frame": frame})``. It needs no part of this
+        ``onnxruntime.InferenceSession(path).run(None, {"frame": frame})``. A policy that reads
+        joints takes them float32 ``[J]`` after the frame, as ``"joints"``. It needs no part of this
         package. Before it is written, its actions are compared with those of `act` on frames of
         noise.
 
@@ -282,9 +304,14 @@ class TrainedPolicy:
         shape = (*self.encoders.frame_network.frame_shape, 3)
         noise = torch.Generator().manual_seed(0)
         frames = torch.randint(256, (8, *shape), generator=noise, dtype=torch.uint8)
+        inputs: list[tuple[Tensor, ...]] = [(frame,) for frame in frames]
+        if self._joints is not None:
+            size, center, scale = self._joints.size, self._joints.center, self._joints.scale
+            drawn = torch.randn(8, size, generator=noise) * torch.tensor(scale)
+            inputs = [*zip(frames, drawn + torch.tensor(center), strict=True)]
         # Traced with the weights of today, which may decide what is computed at all.
-        traced = make_fx(lambda frame: self._action(frame))(frames[0])
-        program = torch.export.export(traced, (frames[0],))
+        traced = make_fx(lambda *seen: self._action(*seen))(*inputs[0])
+        program = torch.export.export(traced, inputs[0])
         scene = find_scene(self.config.scene)
         about = json.dumps({"scene": scene.identity, "rate": scene.rate, "tasks": [*self.tasks]})
         if path.suffix == ".onnx":
@@ -292,9 +319,9 @@ class TrainedPolicy:
             made = _onnx_actions(content)
         else:
             content, made = None, program.module()
-        for frame in frames:
-            expected = torch.from_numpy(self.act(frame))
-            if not torch.allclose(made(frame), expected, rtol=0, atol=1e-5):
+        for seen in inputs:
+            expected = torch.from_numpy(self.act(*seen))
+            if not torch.allclose(made(*seen), expected, rtol=0, atol=1e-5):
                 raise RuntimeError("the exported program acts otherwise than the policy")
         make_folder(path.parent)
         if content is not None:
@@ -337,7 +364,11 @@ def _onnx_model(program: torch.export.ExportedProgram, about: str) -> bytes:
             log.setLevel(logging.ERROR)  # They report what they leave as it is.
         with warnings.catch_warnings(action="ignore", category=FutureWarning):
             made = torch.onnx.export(
-                program, dynamo=True, verbose=False, input_names=["frame"], output_names=["action"]
+                program,
+                dynamo=True,
+                verbose=False,
+                input_names=["frame", "joints"][: len(program.graph_signature.user_inputs)],
+                output_names=["action"],
             )
     finally:
         for log, level in zip(logs, levels, strict=True):
@@ -348,11 +379,16 @@ def _onnx_model(program: torch.export.ExportedProgram, about: str) -> bytes:
     return model.SerializeToString()
 
 
-def _onnx_actions(model: bytes) -> Callable[[Tensor], Tensor]:
-    """Return what maps a frame to the action of an ONNX model, by onnxruntime."""
+def _onnx_actions(model: bytes) -> Callable[..., Tensor]:
+    """Return what maps a frame, and joints, to the action of an ONNX model, by onnxruntime."""
     runtime: Any = importlib.import_module("onnxruntime")
     session = runtime.InferenceSession(model, providers=["CPUExecutionProvider"])
-    return lambda frame: torch.from_numpy(session.run(None, {"frame": frame.numpy()})[0])
+
+    def act(*seen: Tensor) -> Tensor:
+        named = zip(("frame", "joints"), (entry.numpy() for entry in seen), strict=False)
+        return torch.from_numpy(session.run(None, dict(named))[0])
+
+    return act
 
 
 def load_run(

@@ -17,18 +17,34 @@ from torchrl.envs import EnvBase, Transform, TransformedEnv
 from bgpo_trl.algorithms.environments import training_env
 from bgpo_trl.algorithms.proposal_trials import ProposalTrials
 from bgpo_trl.algorithms.rl import Learner
-from bgpo_trl.configs import AlgorithmConfig
+from bgpo_trl.configs import AlgorithmConfig, BGPOConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
 from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.scenes import Scene, find_scene
+from bgpo_trl.scenes import Scene, StateColumns, find_scene
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import DemonstrationSource
 
-__all__ = ["Algorithm", "Policy"]
+__all__ = ["Algorithm", "Policy", "read_joints"]
+
+
+def read_joints(config: AlgorithmConfig, scene: Scene) -> StateColumns | None:
+    """Return the scale of the joints if policies read them, else None.
+
+    Raises:
+        ValueError: If they are to read joints that the scene does not have.
+    """
+    if not (isinstance(config, BGPOConfig) and config.joints):
+        return None
+    if scene.joints is None:
+        raise ValueError(
+            f"the scene {scene.name!r} has no joints for policies to read: set joints to False, or "
+            "give it Scene.joints and its simulation joints() (docs/extending.md)"
+        )
+    return scene.joints
 
 
 @dataclass(frozen=True)
@@ -96,8 +112,9 @@ class Algorithm(ABC):
         scene: The robot, or its name; NICO by default.
 
     Raises:
-        ValueError: If policies are to read latents without encoders, or the ground truth of a scene
-            that has none; or if actions of the demonstrations have another size than the robot's.
+        ValueError: If policies are to read latents without encoders, or ground truth or joints of a
+            scene that has none; or if actions of the demonstrations have another size than the
+            robot's.
 
     Attributes:
         gwr: GWR-B, or None.
@@ -105,7 +122,8 @@ class Algorithm(ABC):
         conditioning: Transforms from the demonstration and task of an episode to what policies are
             conditioned on, such as ``context``: in training and in tests alike.
         beta: Weight of the intrinsic reward.
-        state_size: Number of features of the state.
+        state_size: Number of features of the state, with joints if policies read them.
+        joints: Scale of the joints that policies read; None if they do not.
         learner: The RL algorithm: losses of actor and critic, optimizer, target networks.
         replay: Transitions of training episodes.
         proposals: Who plays an episode, the clone or what critics choose; None with one proposal.
@@ -162,6 +180,9 @@ class Algorithm(ABC):
             raise ValueError("state='latent' needs trained encoders")
         else:
             self.state_size = encoders.frame_network.latent_size
+        self.joints = read_joints(config, self.scene)
+        if self.joints is not None:
+            self.state_size += self.joints.size
         if bank.steps is not None and bank.steps.action.shape[-1] != self.scene.action_size:
             raise ValueError(
                 f"actions of the demonstrations have {bank.steps.action.shape[-1]} components, "
@@ -189,6 +210,7 @@ class Algorithm(ABC):
             source,
             self.encoders,
             state=self.scene.state,
+            joints=self.joints,
             conditioning=self.conditioning,
             beta=self.beta,
         )
@@ -301,8 +323,9 @@ class Algorithm(ABC):
 
     def replay_keys(self, constant_keys: Sequence[NestedKey] = ()) -> list[NestedKey]:
         """Return the entries of a transition to store, of which some are constant in an episode."""
-        following = (self.config.state, "reward", "terminated", "done")
-        return [self.config.state, *constant_keys, "action", *(("next", key) for key in following)]
+        seen = self.config.observed
+        following = [("next", key) for key in (seen, "reward", "terminated", "done")]
+        return [seen, *constant_keys, "action", *following]
 
     def policy(
         self,
@@ -311,7 +334,7 @@ class Algorithm(ABC):
         network: Tensor | None = None,
     ) -> Policy:
         """Return a policy of `test_actor`, given the attributes of `Policy`."""
-        return Policy(self.test_actor, self.config.state, parameters, context, network)
+        return Policy(self.test_actor, self.config.observed, parameters, context, network)
 
     def demonstrations(
         self, constant_keys: Sequence[NestedKey] = (), own_constants: bool = True
@@ -322,7 +345,8 @@ class Algorithm(ABC):
         for these and ``own_constants``, see `DemonstrationReplay`.
 
         Raises:
-            ValueError: If the state is not the latent, or the bank has no steps.
+            ValueError: If the state is not the latent, or the bank has no steps, or no joints that
+                policies read.
         """
         if not self.config.demonstration_share:
             return None
@@ -331,11 +355,28 @@ class Algorithm(ABC):
         return DemonstrationReplay(
             self.bank,
             generator=generators(self.seeds, "demonstration replay"),
+            joints=self._demonstrated_joints(),
             constant_keys=constant_keys,
             own_constants=own_constants,
             n_steps=self.config.rl.n_steps,
             gamma=self.config.rl.gamma,
         )
+
+    def _demonstrated_joints(self) -> Tensor | None:
+        """Return the joints of the bank's steps as policies read them, ``[F, J]``, or None."""
+        columns, steps = self.joints, self.bank.steps
+        if columns is None or steps is None:
+            return None
+        if steps.joints is None or steps.joints.shape[1] != columns.size:
+            found = "no joints" if steps.joints is None else f"{steps.joints.shape[1]} joints"
+            raise ValueError(
+                f"the bank has {found} of the demonstrations, policies are to read {columns.size}: "
+                "record or write demonstrations with 'joints' and make the bank again (`bgpo "
+                "bank`), or set joints to False"
+            )
+        scaled = (steps.joints - torch.tensor(columns.center)) / torch.tensor(columns.scale)
+        limit = self.config.state_limit
+        return scaled if limit is None else scaled.clamp(-limit, limit)
 
     def sample(
         self,

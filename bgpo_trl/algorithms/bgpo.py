@@ -69,7 +69,7 @@ class BGPO(Algorithm):
         self._revision = [0] * len(seeds)
         sizes = {None: 0, "label": self.n_tasks}
         context_size = sizes.get(config.context, embedding_size)
-        self.in_keys = [config.state, *(["context"] if context_size else [])]
+        self.in_keys = [config.observed, *(["context"] if context_size else [])]
 
         rl, keys = config.rl, self.in_keys
         spec = LearnerSpec(

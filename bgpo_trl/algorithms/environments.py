@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 from torchrl.envs import (
+    CatTensors,
     ClipTransform,
     Compose,
     EnvBase,
@@ -45,6 +46,7 @@ def training_env(
     encoders: Representation | None,
     *,
     state: StateColumns | None = None,
+    joints: StateColumns | None = None,
     conditioning: Sequence[Transform] = (),
     beta: float = 0.0,
 ) -> TransformedEnv:
@@ -58,6 +60,7 @@ def training_env(
         source: Draws the task and the demonstration of each episode.
         encoders: Trained encoders; None if neither latents nor the intrinsic reward are used.
         state: Scale of the ground truth; None if policies do not read it.
+        joints: Scale of the joints; None if policies do not read them.
         conditioning: Transforms of the demonstration; see `Algorithm`. They are copied.
         beta: Weight of the intrinsic reward; with 0, it is neither added nor measured.
 
@@ -75,7 +78,7 @@ def training_env(
             raise ValueError("matching behaviors needs trained encoders")
         # reward + beta * exp(-||b - phi_g||)
         transforms.append(BehaviorMatchingReward(encoders.lae, beta))
-    transforms += [*clip(config), RewardSum()]  # episode_reward, ...
+    transforms += [*beside_joints(joints), *clip(config), RewardSum()]  # episode_reward, ...
     return TransformedEnv(base_env, Compose(transforms))
 
 
@@ -127,9 +130,11 @@ def observation_env(
     base_env: EnvBase,
     encoders: Representation | None,
     state: StateColumns | None = None,
+    joints: StateColumns | None = None,
 ) -> TransformedEnv:
     """Return the environment of test episodes, whose policies are already conditioned."""
-    return TransformedEnv(base_env, Compose([encode(config, encoders, state), *clip(config)]))
+    observe = [encode(config, encoders, state), *beside_joints(joints), *clip(config)]
+    return TransformedEnv(base_env, Compose(observe))
 
 
 def encode(
@@ -151,6 +156,21 @@ def encode(
     return ObservationNorm(loc, scale, in_keys=["state"], standard_normal=True)
 
 
+def beside_joints(joints: StateColumns | None) -> list[Transform]:
+    """Return the transforms that put scaled joints beside the latent, or none.
+
+    Reads ``"latent"`` and ``"joints"``; writes ``"latent_and_joints"``. The latent stays as it is,
+    since demonstrations are embedded without joints.
+    """
+    if joints is None:
+        return []
+    loc, scale = torch.tensor(joints.center), torch.tensor(joints.scale)
+    return [
+        ObservationNorm(loc, scale, ["joints"], ["scaled_joints"], standard_normal=True),
+        CatTensors(["latent", "scaled_joints"], "latent_and_joints", del_keys=False, sort=False),
+    ]
+
+
 def clip(config: AlgorithmConfig) -> list[Transform]:
     """Return the transform that bounds the observed state to ``config.state_limit``, or none.
 
@@ -158,4 +178,4 @@ def clip(config: AlgorithmConfig) -> list[Transform]:
     `BehaviorMatchingReward`, since demonstrations are embedded without clipping.
     """
     limit = config.state_limit
-    return [] if limit is None else [ClipTransform([config.state], low=-limit, high=limit)]
+    return [] if limit is None else [ClipTransform([config.observed], low=-limit, high=limit)]

@@ -155,6 +155,11 @@ class AlgorithmConfig(Settings):
     """Standard deviation of the noise added to the demonstrated states that a policy imitates.
     Ours: keeps policies from learning a few demonstrations by heart (docs/learning.md)."""
 
+    @property
+    def observed(self) -> str:
+        """Entry that policies read of the robot: the state, alone or with more beside it."""
+        return self.state
+
     def __post_init__(self) -> None:
         super().__post_init__()
         share = self.demonstration_share
@@ -288,6 +293,14 @@ class BGPOConfig(AlgorithmConfig):
     group_evidence: float = 1.0
     """Depth of the valley of density between two groups, in multiples of what chance explains
     (`density_clusters`). Ours."""
+    joints: bool = False
+    """Whether policies and critics read the robot's joints beside the latent, in a scene that has
+    them (`Scene.joints`). Ours."""
+
+    @property
+    def observed(self) -> str:
+        """See `AlgorithmConfig`; latent and joints side by side are one entry."""
+        return "latent_and_joints" if self.joints else self.state
 
     @property
     def grouped(self) -> bool:
@@ -302,6 +315,8 @@ class BGPOConfig(AlgorithmConfig):
         at_least(self, 4, "group_size")
         holds = self.group_balanced_replay or not self.experts
         check(self, ("group_balanced_replay", holds, "set where there are experts"))
+        beside = self.state == "latent" or not self.joints
+        check(self, ("joints", beside, "off with state='state', which tells more"))
         _check_played(self, self.expert_batch_size if self.experts else self.rl.batch_size)
 
 

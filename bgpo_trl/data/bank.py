@@ -29,6 +29,8 @@ class DemonstrationSteps:
         action: Action from each frame to the next, int8 ``[F, A]``; undefined at a last frame.
         first: Index of the first frame of each demonstration, int64 ``[N]``.
         length: Number of frames of each, int64 ``[N]``; 0 if its steps are not kept.
+        joints: Readings of the robot's joints in each frame, float32 ``[F, J]``, not quantized;
+            None if they are unknown.
 
     Raises:
         ValueError: If shapes or dtypes do not match, or an index lies outside ``latent``.
@@ -38,6 +40,7 @@ class DemonstrationSteps:
     action: Tensor
     first: Tensor
     length: Tensor
+    joints: Tensor | None = None
 
     def __post_init__(self) -> None:
         if not (
@@ -50,15 +53,25 @@ class DemonstrationSteps:
             and bool((self.first + self.length <= len(self.latent)).all())
         ):
             raise ValueError("the shapes, dtypes or indices of its steps do not match")
+        joints = self.joints
+        if joints is not None and not (
+            joints.dtype == torch.float32
+            and joints.shape[:-1] == self.latent.shape[:1]
+            and bool(joints.isfinite().all())
+        ):
+            raise ValueError("the joints of its steps are not finite float32 numbers of each frame")
 
     @classmethod
-    def of(cls, latent: Tensor, action: Tensor, length: Tensor) -> DemonstrationSteps:
+    def of(
+        cls, latent: Tensor, action: Tensor, length: Tensor, joints: Tensor | None = None
+    ) -> DemonstrationSteps:
         """Quantize padded demonstrations.
 
         Args:
             latent: Standardized latents ``[N, T, 64]``; clipped at five standard deviations.
             action: Actions in [-1, 1], ``[N, T - 1, A]``.
             length: Number of frames to keep of each, int64 ``[N]``.
+            joints: Readings of the robot's joints, float32 ``[N, T, J]``, or None.
         """
         valid = torch.arange(latent.shape[1]) < length.unsqueeze(-1)
         padded = torch.nn.functional.pad(action, (0, 0, 0, 1))
@@ -67,6 +80,7 @@ class DemonstrationSteps:
             (padded[valid] * _ACTION_CODES).round().clamp(-127, 127).to(torch.int8),
             length.cumsum(0) - length,
             length.clone(),
+            None if joints is None else joints[valid],
         )
 
     def latents(self, frame: Tensor) -> Tensor:
@@ -86,15 +100,19 @@ class DemonstrationSteps:
         first = self.length.cumsum(0) - self.length
         frame = torch.arange(int(self.length.sum()))
         frame += (self.first - first).repeat_interleave(self.length)
-        return replace(self, latent=self.latent[frame], action=self.action[frame], first=first)
+        joints = None if self.joints is None else self.joints[frame]
+        latent, action = self.latent[frame], self.action[frame]
+        return replace(self, latent=latent, action=action, first=first, joints=joints)
 
     def __add__(self, other: DemonstrationSteps) -> DemonstrationSteps:
-        """Concatenate the steps of two sets of demonstrations."""
+        """Concatenate the steps of two sets of demonstrations, with joints if both have some."""
+        joints = [steps.joints for steps in (self, other) if steps.joints is not None]
         return DemonstrationSteps(
             torch.cat([self.latent, other.latent]),
             torch.cat([self.action, other.action]),
             torch.cat([self.first, other.first + len(self.latent)]),
             torch.cat([self.length, other.length]),
+            torch.cat(joints) if len(joints) == 2 else None,
         )
 
 
@@ -262,7 +280,7 @@ class DemonstrationBank:
         tensors = {"embedding": self.embedding, "task": self.task, "train": self.train}
         if self.steps is not None:
             steps = vars(self.steps.compact())
-            tensors |= {f"steps.{key}": value for key, value in steps.items()}
+            tensors |= {f"steps.{key}": value for key, value in steps.items() if value is not None}
         return tensors
 
     @classmethod

@@ -57,7 +57,12 @@ def is_dataset(path: Path) -> bool:
 
 
 def layout_of(
-    scene: Scene, *, max_steps: int | None = None, actions: bool = True, states: bool = True
+    scene: Scene,
+    *,
+    max_steps: int | None = None,
+    actions: bool = True,
+    states: bool = True,
+    joints: bool = True,
 ) -> dict[str, Any]:
     """Return the settings that fix the sizes of a dataset of a scene.
 
@@ -66,6 +71,7 @@ def layout_of(
         max_steps: Length of the longest episode; by default the scene's.
         actions: Whether the actions are known.
         states: Whether the ground truth is known, if the scene has some.
+        joints: Whether the joints are known, if the scene has some.
     """
     return {
         "scene": scene.name,
@@ -74,6 +80,7 @@ def layout_of(
         "max_steps": max_steps or scene.max_steps,
         "action_size": scene.action_size if actions else 0,
         "state_size": scene.state.size if states and scene.state is not None else 0,
+        **({"joint_size": scene.joints.size} if joints and scene.joints is not None else {}),
     }
 
 
@@ -159,7 +166,9 @@ def _is_complete(meta: Mapping[str, Any]) -> bool:
         and isinstance(meta.get("frame_shape"), list)
         and len(meta["frame_shape"]) == 2
         and all(type(size) is int and 0 < size < 2**13 for size in meta["frame_shape"])
-        and all(type(meta.get(name)) is int and 0 <= meta[name] < 2**20 for name in sizes)
+        and all(type(size) is int and 0 <= size < 2**20 for size in map(meta.get, sizes))
+        and type(joints := meta.get("joint_size", 1)) is int
+        and 0 < joints < 2**20
         and type(meta.get("rows")) is int  # not a bool
         and 0 < meta["rows"] < 2**31
     )
@@ -177,6 +186,8 @@ def _empty(meta: Mapping[str, Any]) -> TensorDict:
     }
     if meta["state_size"]:
         columns["state"] = torch.zeros(()).expand(n, steps + 1, meta["state_size"])
+    if "joint_size" in meta:
+        columns["joints"] = torch.zeros(()).expand(n, steps + 1, meta["joint_size"])
     if meta["action_size"]:
         columns["action"] = torch.zeros(()).expand(n, steps, meta["action_size"])
     return TensorDict(columns, [n])
@@ -184,7 +195,7 @@ def _empty(meta: Mapping[str, Any]) -> TensorDict:
 
 Episodes = Mapping[str, Sequence[Mapping[str, Any]]]
 """Episodes by the name of their task; for an episode's entries, see `write_demonstrations`."""
-_KEYS = ("pixels", "action", "state")
+_KEYS = ("pixels", "action", "state", "joints")
 
 
 def write_demonstrations(
@@ -200,10 +211,11 @@ def write_demonstrations(
 
     An episode is a mapping with ``pixels`` uint8 ``[T, H, W, 3]``, frames of the scene's size with
     ``T`` of at least 2; ``action`` ``[T - 1, A]`` in [-1, 1], from each frame to the next and with
-    the meaning of the scene's actions; and ``state`` ``[T, N]``, the ground truth. Actions and
-    states may be left out of all episodes, but not of some. Without actions, encoders have no
-    inverse model, unless play is recorded for it, and banks no steps: demonstrations then tell the
-    task, but are no experience. The ground truth serves probes alone.
+    the meaning of the scene's actions; ``joints`` ``[T, J]``, readings of the robot's joints; and
+    ``state`` ``[T, N]``, the ground truth. All but frames may be left out of all episodes, but not
+    of some. Without actions, encoders have no inverse model, unless play is recorded for it, and
+    banks no steps: demonstrations then tell the task, but are no experience. Without joints, they
+    are none for policies that read joints. The ground truth serves probes alone.
 
     All episodes are checked before anything is written. Each is indexed twice, so a sequence may
     load its episodes from files on demand.
@@ -244,6 +256,7 @@ def write_demonstrations(
             max_steps=max(lengths) - 1,
             actions="action" in keys,
             states="state" in keys,
+            joints="joints" in keys,
         ),
         "tasks": tasks,
         "rows": len(lengths),
@@ -341,9 +354,12 @@ def check_episode(scene: Scene, episode: Mapping[str, Any]) -> int:
         )
     if "state" in episode and scene.state is None:
         raise ValueError(f"has a state, but the scene {scene.name!r} has no ground truth: omit it")
+    if "joints" in episode and scene.joints is None:
+        raise ValueError(f"has joints, but the scene {scene.name!r} has none: omit them")
     shapes = {"action": (length - 1, scene.action_size)}
-    if scene.state is not None:
-        shapes["state"] = (length, scene.state.size)
+    for key, columns in (("state", scene.state), ("joints", scene.joints)):
+        if columns is not None:
+            shapes[key] = (length, columns.size)
     for key in shapes.keys() & episode.keys():
         values, shape = np.asarray(episode[key]), shapes[key]
         if values.dtype.kind not in "fiu" or values.shape != shape:
@@ -366,11 +382,11 @@ def _check_keys(episode: object, keys: set[str] | None) -> None:
         )
     names = ", ".join(repr(key) for key in episode) or "nothing"
     if "pixels" not in episode or not {*episode} <= {*_KEYS}:
-        raise ValueError(f"has {names}: give 'pixels', and if known 'action' and 'state'")
+        raise ValueError(f"has {names}: give 'pixels', and if known 'action', 'joints', 'state'")
     if keys not in (None, {*episode}):
         raise ValueError(
-            f"has {names}, those before it {', '.join(map(repr, sorted(keys)))}: give actions, and "
-            "states, of all episodes or of none"
+            f"has {names}, those before it {', '.join(map(repr, sorted(keys)))}: give actions, "
+            "joints and states of all episodes or of none"
         )
 
 

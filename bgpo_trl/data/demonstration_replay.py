@@ -25,6 +25,8 @@ class DemonstrationReplay:
     Args:
         bank: Demonstrations that episodes are drawn from, with their steps.
         generator: Random generators for sampling, one for each of ``S`` seeds.
+        joints: Joints in each frame of the bank's steps, as policies read them, float32
+            ``[F, J]``, by which ``"latent_and_joints"`` stands in place of ``"latent"``; or None.
         constant_keys: Entries that are constant within an episode, stored with each demonstration.
         own_constants: Whether a transition comes with the constant entries of its own
             demonstration, or else with those of any one of its group.
@@ -41,6 +43,7 @@ class DemonstrationReplay:
         bank: DemonstrationBank,
         *,
         generator: Sequence[torch.Generator],
+        joints: Tensor | None = None,
         constant_keys: Sequence[NestedKey] = (),
         own_constants: bool = True,
         n_steps: int = 1,
@@ -59,7 +62,8 @@ class DemonstrationReplay:
                 f"the bank has no steps of demonstration {row} to learn from: make it again with "
                 "`bgpo bank`, or choose --algorithm bgpo-experts"
             )
-        self._steps = bank.steps
+        self._steps, self._joints = bank.steps, joints
+        self._key = "latent" if joints is None else "latent_and_joints"
         self._generators = list(generator)
         self._n_steps, self._gamma = n_steps, gamma
         self._own_constants = own_constants
@@ -111,8 +115,8 @@ class DemonstrationReplay:
         return {
             **entries,
             **several,
-            "latent": self._steps.latents(frame),
-            ("next", "latent"): self._steps.latents(frame + n_taken),
+            self._key: self._states(frame),
+            ("next", self._key): self._states(frame + n_taken),
             ("next", "reward"): reward.unsqueeze(-1) * ends,
             ("next", "terminated"): ends,
             ("next", "done"): ends,
@@ -137,9 +141,14 @@ class DemonstrationReplay:
         """
         sources = self._generators if generator is None else generator
         entries, _, frame, _ = self._draw_frames(group, sources)
+        state = self._states(frame)
+        drawn = draw_for_rows(torch.randn, group, sources, state.shape[-1])
+        return {**entries, self._key: state + noise * drawn}
+
+    def _states(self, frame: Tensor) -> Tensor:
+        """Return what policies read of frames int64 ``[...]``, float32 ``[..., features]``."""
         latent = self._steps.latents(frame)
-        drawn = draw_for_rows(torch.randn, group, sources, latent.shape[-1])
-        return {**entries, "latent": latent + noise * drawn}
+        return latent if self._joints is None else torch.cat([latent, self._joints[frame]], -1)
 
     def _draw_frames(
         self, group: Tensor, sources: Sequence[torch.Generator]

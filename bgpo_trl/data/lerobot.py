@@ -44,6 +44,7 @@ def read_lerobot(
     image_key: str | None = None,
     action_key: str | None = "action",
     state_key: str | None = None,
+    joints_key: str | None = None,
     success_key: str | None = "next.success",
     frame_shape: Sequence[int] | None = None,
     episodes: Collection[int] | None = None,
@@ -62,6 +63,8 @@ def read_lerobot(
         image_key: Name of the camera; may be left out if there is one, apart from depth maps.
         action_key: Feature with the actions; None leaves them out.
         state_key: Feature with the scene's ground truth; None leaves it out.
+        joints_key: Feature with the readings of the scene's joints, such as
+            ``"observation.state"``; None leaves them out.
         success_key: Feature that is true in a frame of each episode that succeeded, if the dataset
             has it. Failed episodes are refused; with None, they are read.
         frame_shape: Height and width to which frames are resized, see `resize_frames`; by default
@@ -75,15 +78,15 @@ def read_lerobot(
 
     Returns:
         Episodes in their order by the description of their task: ``pixels`` uint8
-        ``[T, H, W, 3]`` and, as asked for, ``action`` ``[T - 1, A]`` and ``state`` ``[T, N]``,
-        float32. Rename the tasks to those of the scene.
+        ``[T, H, W, 3]`` and, as asked for, ``action`` ``[T - 1, A]``, ``state`` ``[T, N]`` and
+        ``joints`` ``[T, J]``, float32. Rename the tasks to those of the scene.
 
     Raises:
         ValueError: If the folder is no LeRobot dataset of version 3, a file is damaged or missing,
             an episode is incomplete or failed, a frame is missing or not at its time, images have
             more than 8 bits a color, or a feature, episode or task to read is not there.
     """
-    wanted = {"action": action_key, "state": state_key}
+    wanted = {"action": action_key, "state": state_key, "joints": joints_key}
     chosen = {key: name for key, name in wanted.items() if name is not None}
     if stride < 1 or ("action" in chosen and stride > 1 and combine is None):
         raise ValueError(
@@ -169,7 +172,8 @@ class _Reader:
             if not self.features.get(name, "").startswith(("float", "int", "uint")):
                 numbers = [n for n, dtype in self.features.items() if dtype.startswith("float")]
                 raise ValueError(
-                    f"{self.path} has no numbers {name!r}: give the {key}s' feature as {key}_key, "
+                    f"{self.path} has no numbers {name!r}: give the "
+                    f"{key.removesuffix('s')}s' feature as {key}_key, "
                     f"one of {', '.join(numbers) or 'none'}, or None if there is none"
                 )
 
@@ -382,7 +386,11 @@ def _frames_at(
 _DATA = "data/chunk-{:03d}/file-{:03d}.parquet"
 _FILE_BYTES, _FILES_PER_CHUNK = 100 * 2**20, 1000
 _INDICES = ("frame_index", "episode_index", "index", "task_index")
-_KEYS = {"action": "action", "state": "observation.environment_state"}
+_KEYS = {
+    "action": "action",
+    "state": "observation.environment_state",
+    "joints": "observation.state",
+}
 
 
 def write_lerobot(
@@ -404,8 +412,9 @@ def write_lerobot(
         path: Folder of the LeRobot dataset, which must not exist.
         dataset: Demonstrations of `load_demonstrations`, or some, such as
             ``dataset[dataset["train"]]``. Reads ``pixels`` uint8 ``[N, T, H, W, 3]``, ``length``
-            and ``task`` ``[N]``, and, if they are there, ``action`` ``[N, T - 1, A]`` and
-            ``state`` ``[N, T, F]`` (as ``observation.environment_state``).
+            and ``task`` ``[N]``, and, if they are there, ``action`` ``[N, T - 1, A]``,
+            ``state`` ``[N, T, F]`` (as ``observation.environment_state``) and ``joints``
+            ``[N, T, J]`` (as ``observation.state``).
         tasks: Names or descriptions of the tasks, in the order of their labels.
         fps: Frames per second, 5 for NICO.
         image_key: Name of the camera.

@@ -23,7 +23,7 @@ from bgpo_trl.data.dataset import (
 )
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.scenes import Scene, Simulation, find_scene
-from bgpo_trl.scenes.scene import checked_frame, checked_state, checked_step
+from bgpo_trl.scenes.scene import checked_frame, checked_numbers, checked_step
 
 _Policy = Callable[[], np.ndarray]
 
@@ -63,7 +63,8 @@ def record_demonstrations(
 
     Returns:
         A memory-mapped TensorDict ``[N]`` with ``pixels`` uint8 ``[N, T + 1, H, W, 3]``, ``state``
-        ``[N, T + 1, F]`` if the scene has ground truth, ``action`` ``[N, T, A]``, ``length`` int64
+        ``[N, T + 1, F]`` if the scene has ground truth, ``joints`` ``[N, T + 1, J]`` if it has
+        joints, ``action`` ``[N, T, A]``, ``length`` int64
         ``[N]`` (frames, one more than actions), ``task`` int64 ``[N]``, ``train`` bool ``[N]``
         (``False``: held out) and ``seed`` int64 ``[N]``; zero beyond the length.
 
@@ -182,7 +183,7 @@ class _Recorder:
         assert scene.demonstrator is not None  # checked before
         act = policy_of(scene.demonstrator(simulation, task, noise))
         shape = scene.frame_shape
-        frames, states, actions = [checked_frame(simulation, shape)], [self._state()], []
+        frames, numbers, actions = [checked_frame(simulation, shape)], [self._numbers()], []
         success = False
         for _ in range(scene.max_steps):
             action = act()
@@ -193,21 +194,25 @@ class _Recorder:
             success, failure, executed = checked_step(simulation, action)
             actions.append(executed)
             frames.append(checked_frame(simulation, shape))
-            states.append(self._state())
+            numbers.append(self._numbers())
             if success or failure:
                 break
         episode = {"pixels": np.stack(frames), "action": np.stack(actions)}
-        if scene.state is not None:
-            episode["state"] = np.stack(states)
+        episode |= {key: np.stack([moment[key] for moment in numbers]) for key in numbers[0]}
         try:
             check_episode(scene, episode)
         except ValueError as error:
             raise ValueError(f"an episode of the demonstrator of {task!r} {error}") from None
         return episode, success
 
-    def _state(self) -> np.ndarray:
-        columns = self.scene.state
-        return np.empty(0) if columns is None else checked_state(self.simulation, columns.size)
+    def _numbers(self) -> dict[str, np.ndarray]:
+        """Return ground truth and joints, where the scene has some."""
+        found, scene = dict[str, np.ndarray](), self.scene
+        if scene.state is not None:
+            found["state"] = checked_numbers(self.simulation, "state", scene.state.size)
+        if scene.joints is not None:
+            found["joints"] = checked_numbers(self.simulation, "joints", scene.joints.size)
+        return found
 
 
 def _record_rows(

@@ -21,12 +21,12 @@ def make_bank(
     actions: Literal["inferred", "recorded"] = "recorded",
     spread: float = 1.0,
 ) -> DemonstrationBank:
-    """Embed demonstrations; keep the latents and actions of the training ones.
+    """Embed demonstrations; keep latents, actions and joints of the training ones.
 
     Args:
         representation: The trained encoders.
         dataset: Reads ``pixels`` ``[N, T, H, W, 3]``, ``length``, ``task`` and ``train`` ``[N]``,
-            and ``action`` ``[N, T - 1, A]``.
+            and, if they are there, ``action`` ``[N, T - 1, A]`` and ``joints`` ``[N, T, J]``.
         tasks: Task names, in the order of their labels.
         actions: ``"recorded"`` stores the actions of the dataset, or if it has none those that
             the inverse model infers from the frames; ``"inferred"`` always the latter, the only
@@ -40,13 +40,13 @@ def make_bank(
     if actions == "inferred" or action is None:
         inverse = representation.inverse
         action = None if inverse is None else inverse(latent, length)
-    train = dataset["train"].clone()
+    train, joints = dataset["train"].clone(), dataset.get("joints", None)
     return DemonstrationBank(
         representation.lae.encode(latent, length),
         dataset["task"].clone(),
         train,
         tuple(tasks),
-        None if action is None else DemonstrationSteps.of(latent, action, length * train),
+        None if action is None else DemonstrationSteps.of(latent, action, length * train, joints),
         representation.identity,
         spread,
         representation.metadata.get("scene"),

@@ -98,7 +98,9 @@ def train_encoders(
     bank.save(bank_path(weights))
     play = None if keep else play
     found = probe(representation, dataset, folder, play=play, columns=scene.state)
-    for complaint in complaints(found):
+    # Actions of the inverse model are good for nothing else than banks.
+    unused = {"inverse_r2"} if actions == "recorded" else set[str]()
+    for complaint in complaints({key: found[key] for key in found if key not in unused}):
         warnings.warn(f"{complaint} ({folder})", stacklevel=2)
     return representation, bank
 

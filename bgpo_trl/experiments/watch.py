@@ -18,7 +18,7 @@ from bgpo_trl.files.writing import check_folder
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import TrainedPolicy, load_run
 from bgpo_trl.scenes import Scene, Simulation, find_scene
-from bgpo_trl.scenes.scene import checked_frame, checked_step
+from bgpo_trl.scenes.scene import checked_frame, checked_numbers, checked_step
 
 _HEIGHT = 128  # (pixels) of each picture
 _BORDER, _CAPTION, _GAP = 4, 18, 8
@@ -81,7 +81,9 @@ def play(policy: TrainedPolicy, task: str, demonstration: NDArray, seed: int) ->
     simulation.reset(task)
     seen, views, success = [checked_frame(simulation, shape)], [_view(simulation)], False
     for _ in range(config.algorithm.max_steps):
-        action = policy.act(seen[-1]).astype(np.float64)
+        columns = policy.algorithm.joints
+        joints = columns and checked_numbers(simulation, "joints", columns.size)
+        action = policy.act(seen[-1], joints).astype(np.float64)
         success, failure, _ = checked_step(simulation, action)
         seen.append(checked_frame(simulation, shape))
         views.append(_view(simulation))

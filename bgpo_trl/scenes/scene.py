@@ -26,7 +26,7 @@ __all__ = [
     "StateColumns",
     "Weights",
     "checked_frame",
-    "checked_state",
+    "checked_numbers",
     "checked_step",
     "find_scene",
 ]
@@ -53,8 +53,8 @@ class Simulation(ABC):
     """One simulated robot, of which `SimulationEnv` steps several side by side.
 
     A subclass for a robot of your own defines `seed`, `reset`, `step` and `frame`. With `state`,
-    policies can learn from the ground truth; with `save` and `load`, runs can be resumed; with
-    `view`, films show the robot.
+    policies can learn from the ground truth; with `joints`, from the robot's joints beside frames;
+    with `save` and `load`, runs can be resumed; with `view`, films show the robot.
     """
 
     @abstractmethod
@@ -79,6 +79,10 @@ class Simulation(ABC):
     def state(self) -> NDArray[Any]:
         """Return the ground truth, ``[N]``."""
         raise self._lacks("state()")
+
+    def joints(self) -> NDArray[Any]:
+        """Return the readings of the robot's own joints, ``[J]``, which a real robot has too."""
+        raise self._lacks("joints()")
 
     def view(self) -> NDArray[np.uint8]:
         """Return an onlooker's view of the robot for films, ``[H', W', 3]``."""
@@ -112,18 +116,21 @@ def checked_frame(simulation: Simulation, frame_shape: Sequence[int]) -> NDArray
     return frame
 
 
-def checked_state(simulation: Simulation, size: int) -> NDArray[np.float32]:
-    """Return a simulation's ground truth, float32 ``[size]``.
+def checked_numbers(
+    simulation: Simulation, method: Literal["state", "joints"], size: int
+) -> NDArray[np.float32]:
+    """Return a simulation's ground truth or joints, float32 ``[size]``.
 
     Raises:
         ValueError: If it is something else than so many finite numbers.
     """
-    found = simulation.state()
-    state = np.asarray(found)
-    if state.dtype.kind not in "fiu" or state.shape != (size,) or not np.isfinite(state).all():
+    found = getattr(simulation, method)()
+    numbers = np.asarray(found)
+    kind, shape = numbers.dtype.kind, numbers.shape
+    if kind not in "fiu" or shape != (size,) or not np.isfinite(numbers).all():
         wanted = f"{size} finite numbers, as the scene's StateColumns say"
-        raise _refusal(simulation, "state", short_repr(found), wanted)
-    return state.astype(np.float32)
+        raise _refusal(simulation, method, short_repr(found), wanted)
+    return numbers.astype(np.float32)
 
 
 def checked_step(simulation: Simulation, action: NDArray[np.float64]) -> Outcome:
@@ -249,6 +256,9 @@ class Scene:
         demonstrator: Function from a simulation at the start of an episode, the name of the task
             and the seed of its noise to a function that returns the next action ``[A]``.
         state: Meaning of the ground truth.
+        joints: Mean and spread of each joint's reading, by which policies that read joints beside
+            frames scale them (`BGPOConfig.joints`); part of what ``version`` stands for. None if
+            `Simulation.joints` is not defined.
         weights: Encoders that come with it.
         modules: Modules that define tasks which are not the scene's own, by name of the task.
     """
@@ -269,6 +279,7 @@ class Scene:
     has_spread: bool = False
     demonstrator: Callable[[Simulation, str, int], Callable[[], NDArray[Any]]] | None = None
     state: StateColumns | None = None
+    joints: StateColumns | None = None
     weights: Weights | None = None
     modules: Callable[[Sequence[str]], Mapping[str, str]] = lambda _: {}
 
@@ -351,8 +362,8 @@ class Scene:
             observation: ``"pixels"``, ``"state"`` or ``"both"``.
 
         Raises:
-            ValueError: If a task is unknown, or ground truth or spread are asked of a scene that
-                has none.
+            ValueError: If a task is unknown, ground truth or spread are asked of a scene that has
+                none, or the environment does not observe the scene's joints.
         """
         self.check_tasks(tasks)
         self.check_spread(spread)
@@ -361,9 +372,17 @@ class Scene:
         if self.make_env is None:
             raise ValueError(f"the scene {self.name!r} has no simulation: give it a make_env")
         options: dict[str, Any] = {"spread": spread} if self.has_spread else {}
-        return self.make_env(
+        env = self.make_env(
             tasks, batch_size=batch_size, seed=seed, observation=observation, **options
         )
+        if self.joints is not None:
+            spec = env.observation_spec.get("joints", None)
+            if spec is None or spec.shape[-1] != self.joints.size:
+                raise ValueError(
+                    f"the scene {self.name!r} has {self.joints.size} joints, which its environment "
+                    f"does not observe: make it with joint_size={self.joints.size}"
+                )
+        return env
 
     def check_tasks(self, tasks: Sequence[str]) -> None:
         """Raise ``ValueError`` if a task does not exist or is named twice."""

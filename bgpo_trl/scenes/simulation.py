@@ -19,7 +19,7 @@ from bgpo_trl.scenes.scene import (
     Outcome,
     Simulation,
     checked_frame,
-    checked_state,
+    checked_numbers,
     checked_step,
 )
 from bgpo_trl.seeding import Seeding, row_seeds
@@ -36,10 +36,10 @@ class SimulationEnv(EnvBase):
     the simulation says: append ``StepCounter(max_steps)`` for a time limit.
 
     Writes at reset and step: ``"pixels"`` uint8 ``[*B, H, W, 3]`` and/or ``"state"`` float32
-    ``[*B, N]``; ``"task"`` int64 ``[*B]``, an index into ``tasks``; ``"success"`` bool
-    ``[*B, 1]``. Reads ``"action"`` float32 ``[*B, A]`` in [-1, 1]; numbers beyond count as its
-    ends. ``"reward"`` is 1 on success, else 0; ``"terminated"`` and ``"done"`` are success or
-    failure, ``"truncated"`` is never set here.
+    ``[*B, N]``; with ``joint_size``, ``"joints"`` float32 ``[*B, J]``; ``"task"`` int64 ``[*B]``,
+    an index into ``tasks``; ``"success"`` bool ``[*B, 1]``. Reads ``"action"`` float32 ``[*B, A]``
+    in [-1, 1]; numbers beyond count as its ends. ``"reward"`` is 1 on success, else 0;
+    ``"terminated"`` and ``"done"`` are success or failure, ``"truncated"`` is never set here.
 
     An optional boolean entry ``"_step"`` ``[*B]`` selects the simulations that advance; the others
     repeat their last observation.
@@ -55,6 +55,7 @@ class SimulationEnv(EnvBase):
         frame_shape: Height and width of a frame.
         action_size: Number of components of an action.
         state_size: Length of the ground truth; None if there is none.
+        joint_size: Number of joints to observe, see `Simulation.joints`; None for none.
         batch_size: Shape of the batch; an int is the length of a batch of one dimension.
         seed: Seed of the first simulation's starts, from which the others count up; or one for
             each; or None for seeds from the operating system.
@@ -75,6 +76,7 @@ class SimulationEnv(EnvBase):
         frame_shape: Sequence[int],
         action_size: int,
         state_size: int | None = None,
+        joint_size: int | None = None,
         batch_size: int | Sequence[int] = (),
         seed: int | Sequence[int] | None = 0,
         observation: Observation = "pixels",
@@ -105,10 +107,14 @@ class SimulationEnv(EnvBase):
         self._begun = np.zeros(count, dtype=bool)
         self._success, self._failure = np.zeros((2, count), dtype=bool)
         self._current: dict[str, np.ndarray] = {}
-        self._make_specs((*frame_shape, 3), state_size, action_size)
+        self._make_specs((*frame_shape, 3), state_size, action_size, joint_size)
 
     def _make_specs(
-        self, frame_shape: Sequence[int], state_size: int | None, action_size: int
+        self,
+        frame_shape: Sequence[int],
+        state_size: int | None,
+        action_size: int,
+        joint_size: int | None,
     ) -> None:
         batch, count = self.batch_size, self.batch_size.numel()
         observation: dict[str, Any] = {
@@ -119,11 +125,12 @@ class SimulationEnv(EnvBase):
             shape = torch.Size(frame_shape)
             observation["pixels"] = Bounded(0, 255, shape=batch + shape, dtype=torch.uint8)
             self._current["pixels"] = np.zeros((count, *shape), np.uint8)
-        if self.observation != "pixels" and state_size is not None:
-            observation["state"] = Unbounded(
-                shape=torch.Size([*batch, state_size]), dtype=torch.float32
-            )
-            self._current["state"] = np.zeros((count, state_size), np.float32)
+        numbers = {"state": state_size if self.observation != "pixels" else None}
+        for key, size in {**numbers, "joints": joint_size}.items():
+            if size is not None:
+                shape = torch.Size([*batch, size])
+                observation[key] = Unbounded(shape=shape, dtype=torch.float32)
+                self._current[key] = np.zeros((count, size), np.float32)
         self.observation_spec = Composite(observation, shape=batch)
         # A TransformedEnv passes only entries of the state spec on to `_reset`.
         self.state_spec = Composite({"task": observation["task"].clone()}, shape=batch)
@@ -156,8 +163,9 @@ class SimulationEnv(EnvBase):
         simulation, current = self.simulations[row], self._current
         if "pixels" in current:
             current["pixels"][row] = checked_frame(simulation, current["pixels"].shape[1:3])
-        if "state" in current:
-            current["state"][row] = checked_state(simulation, current["state"].shape[1])
+        for key in ("state", "joints"):
+            if key in current:
+                current[key][row] = checked_numbers(simulation, key, current[key].shape[1])
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         del kwargs
@@ -342,8 +350,12 @@ class RobotEnv(SimulationEnv):
         super().__init__(*args, batch_size=batch_size, **kwargs)
 
     def _make_specs(
-        self, frame_shape: Sequence[int], state_size: int | None, action_size: int
+        self,
+        frame_shape: Sequence[int],
+        state_size: int | None,
+        action_size: int,
+        joint_size: int | None,
     ) -> None:
-        super()._make_specs(frame_shape, state_size, action_size)
+        super()._make_specs(frame_shape, state_size, action_size, joint_size)
         self.observation_spec["executed_action"] = self.action_spec.clone()
         self._current["executed_action"] = np.zeros((1, action_size), np.float32)

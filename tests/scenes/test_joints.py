@@ -1,0 +1,207 @@
+"""The robot's joints beside latents, from the simulation to an exported policy."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.configs import BGPOConfig, RunConfig
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
+from bgpo_trl.data.lerobot import read_lerobot, write_lerobot
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders.make_bank import make_bank
+from bgpo_trl.encoders.train import train_encoders
+from bgpo_trl.experiments.watch import WatchArguments, watch
+from bgpo_trl.policy import load_run
+from bgpo_trl.scenes import SCENES, SimulationEnv, StateColumns
+from bgpo_trl.training import Trainer
+from tests.helpers import TINY_ENCODERS
+from tests.scenes.dot import SavedDot, scene
+
+TASKS = ("left", "right")
+CENTER, SCALE = (0.5, 10.0), (2.0, 4.0)
+
+
+class Jointed(SavedDot):
+    """A dot with two joints, of which the second moves twice as fast."""
+
+    def joints(self):
+        return np.array([self.place, 10.0 + 2.0 * self.place])
+
+
+def jointed(make=Jointed, joint_size=2):
+    """Return the dot as a scene with joints."""
+    shape = {"frame_shape": (16, 24), "action_size": 1}
+    make_env = partial(SimulationEnv, make, joint_size=joint_size, **shape)
+    return replace(scene(), make_env=make_env, joints=StateColumns(center=CENTER, scale=SCALE))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Recorded demonstrations, and encoders and a bank that were made of them."""
+    folder = tmp_path_factory.mktemp("jointed")
+    options = {"per_task": 6, "held_out_per_task": 2, "progress": False}
+    dataset = record_demonstrations(folder / "demonstrations", scene=jointed(), **options)
+    weights, options = folder / "encoders.safetensors", {"scene": jointed(), "progress": False}
+    parts = (dataset, None, weights, folder / "fit", TINY_ENCODERS)
+    return dataset, *train_encoders(*parts, **options)
+
+
+@pytest.fixture
+def dot(monkeypatch):
+    monkeypatch.setitem(SCENES, "dot", jointed())
+
+
+def config_of(**changes):
+    algorithm = replace(ALGORITHMS["bgpo"].config, max_steps=12, joints=True)
+    rl = replace(algorithm.rl, warmup_steps=12, batch_size=8, hidden_sizes=(16,))
+    algorithm = replace(algorithm, rl=rl, expert_batch_size=8, demonstration_noise=0.0, **changes)
+    starts = {"tasks": TASKS, "task_starts": (0, 0), "seeds": (3, 5)}
+    return RunConfig(scene="dot", episodes=4, eval_every=2, algorithm=algorithm, **starts)
+
+
+def trainer_of(made, folder, config=None):
+    parts = {"encoders": made[1], "bank": made[2], "progress": False}
+    return Trainer(config or config_of(), folder, **parts)
+
+
+def scaled(readings):
+    return (readings - torch.tensor(CENTER)) / torch.tensor(SCALE)
+
+
+def farthest(states, recorded):
+    """Return how far the last two features are from the nearest recorded ones, at most."""
+    ways = states[..., -2:].flatten(0, 1).unsqueeze(1) - recorded
+    return ways.abs().amax(-1).amin(1).max()
+
+
+def test_joints_are_observed_recorded_and_kept_in_banks(made, tmp_path):
+    env = jointed().simulate(TASKS, batch_size=[2])
+    moves = torch.tensor([[0.2], [-0.4]])
+    before = env.reset()
+    after = env.step(before.clone().set("action", moves))["next"]
+    torch.testing.assert_close(after["joints"] - before["joints"], moves * torch.tensor([0.5, 1]))
+
+    dataset, _, bank = made
+    length, read = dataset["length"], dataset["joints"]
+    torch.testing.assert_close(read[..., 1], (10 + 2 * read[..., 0]) * (read[..., 1] != 0))
+    steps = bank.seen().steps
+    for row, (first, n_frames) in enumerate(zip(steps.first, steps.length, strict=True)):
+        number = dataset["train"].nonzero().flatten()[row]
+        assert n_frames == length[number]
+        assert steps.joints[first : first + n_frames].equal(read[number, :n_frames])
+    bank.save(tmp_path / "bank.safetensors")
+    loaded = DemonstrationBank.load(tmp_path / "bank.safetensors", encoder_id=bank.encoder_id)
+    assert loaded.identity == bank.identity
+    both = (bank.of_task(1) + loaded.of_task(0)).steps.compact().joints
+    assert sorted(both[:, 0].tolist()) == sorted(bank.steps.compact().joints[:, 0].tolist())
+
+
+def test_joints_of_others_come_by_arrays_and_lerobot(made, tmp_path):
+    dataset, *_ = made
+    write_lerobot(tmp_path / "lerobot", dataset, tasks=TASKS, fps=5)
+    episodes = read_lerobot(tmp_path / "lerobot", joints_key="observation.state")
+    options = {"scene": jointed(), "held_out_per_task": 2}
+    written = write_demonstrations(tmp_path / "own", episodes, **options)
+    n_steps = written["joints"].shape[1]
+    assert written["joints"].equal(dataset["joints"][:, :n_steps])
+    assert load_demonstrations(tmp_path / "own")["joints"].equal(written["joints"])
+
+
+def test_replays_hold_joints_as_policies_read_them(made, dot, tmp_path):
+    """A step moves the dot by half the action, and its joints by as much and twice as much."""
+    with trainer_of(made, tmp_path / "run") as trainer:
+        trainer.run()
+        algorithm = trainer.algorithm
+        played = algorithm.replay.contents(0)[0]
+        groups = torch.zeros(2, 32, dtype=torch.int64)
+        shown = algorithm.shown.draw(groups)
+        imitated = algorithm.shown.draw_actions(groups, 0.0)
+    assert algorithm.in_keys == ["latent_and_joints", "context"]
+    recorded = scaled(made[2].steps.joints)
+    for key in ("latent_and_joints", ("next", "latent_and_joints")):
+        assert farthest(shown[key], recorded) < 1e-6
+    assert farthest(imitated["latent_and_joints"], recorded) < 1e-6
+    moved = played["next", "latent_and_joints"] - played["latent_and_joints"]
+    expected = played["action"] * torch.tensor([0.5, 1.0]) / torch.tensor(SCALE)
+    torch.testing.assert_close(moved[..., -2:], expected, rtol=0, atol=1e-5)
+
+
+def test_policies_and_critics_depend_on_joints(made, dot, tmp_path, refused):
+    with trainer_of(made, tmp_path / "run") as trainer:
+        trainer.run()
+        loss = trainer.algorithm.learner.loss
+        batch = TensorDict(
+            trainer.algorithm.shown.draw(torch.zeros(2, 1, 4, dtype=torch.int64)), [2, 1, 4]
+        )
+        changed = batch.clone()
+        changed["latent_and_joints"][..., -1] += 1.0
+        values = [loss.values("value_network", data) for data in (batch, changed)]
+        assert (values[0] != values[1]).all()
+    policy, frame = load_run(tmp_path / "run"), np.full((16, 24, 3), 90, np.uint8)
+    policy.condition(np.stack([frame] * 4))
+    action = policy.act(frame, [0.5, 11.0])
+    assert not np.array_equal(action, policy.act(frame, [-0.5, 9.0]))
+    for joints, found in ((None, "nothing"), ([0.5], r"float64 \[1\]"), ([np.nan, 1.0], "float64")):
+        with pytest.raises(ValueError, match=f"this policy reads 2 joints, .* got {found}"):
+            policy.act(frame, joints)
+
+    policy.export(tmp_path / "policy.pt2")
+    act = torch.export.load(tmp_path / "policy.pt2").module()
+    exported = act(torch.from_numpy(frame), torch.tensor([0.5, 11.0]))
+    np.testing.assert_allclose(exported.numpy(), action, rtol=0, atol=1e-5)
+    assert "left: " in watch(WatchArguments(run=tmp_path / "run"))
+
+
+def test_policies_without_joints_are_as_before(made, dot, tmp_path):
+    without = replace(config_of(), algorithm=replace(config_of().algorithm, joints=False))
+    with trainer_of(made, tmp_path / "run", without) as trainer:
+        assert trainer.algorithm.in_keys == ["latent", "context"]
+        assert trainer.algorithm.shown is not None
+        trainer.run()
+    policy, frame = load_run(tmp_path / "run"), np.full((16, 24, 3), 90, np.uint8)
+    policy.condition(np.stack([frame] * 4))
+    with pytest.raises(ValueError, match="reads no joints: give it frames alone"):
+        policy.act(frame, [0.5, 11.0])
+    assert not any(entry.config.observed == "latent_and_joints" for entry in ALGORITHMS.values())
+
+
+def test_what_lacks_joints_is_refused_in_a_line(made, monkeypatch, tmp_path, refused):
+    dataset, encoders, bank = made
+    run = tmp_path / "run"
+    monkeypatch.setitem(SCENES, "dot", jointed())
+    blind = make_bank(encoders, dataset.exclude("joints"), tasks=TASKS)
+    parts = (dataset, encoders, blind)
+    refused(lambda: trainer_of(parts, run), "has no joints of the", "make the bank again")
+    other = torch.zeros(len(bank.steps.latent), 3)
+    parts = (dataset, encoders, replace(bank, steps=replace(bank.steps, joints=other)))
+    refused(lambda: trainer_of(parts, run), "has 3 joints", "make the bank again")
+    monkeypatch.setitem(SCENES, "dot", jointed(joint_size=None))
+    refused(lambda: trainer_of(made, run), "does not observe", "joint_size=2")
+    monkeypatch.setitem(SCENES, "dot", scene(SavedDot))
+    refused(lambda: trainer_of(made, run), "has no joints for policies", "set joints to False")
+    frames = np.zeros((3, 16, 24, 3), np.uint8)
+    written = {"pixels": frames, "joints": np.zeros((3, 2))}
+    options = {"held_out_per_task": 0, "scene": scene()}
+    call = partial(write_demonstrations, tmp_path / "own", {"left": [written]}, **options)
+    refused(call, "has joints, but the scene 'dot' has none", "omit them")
+    with pytest.raises(ValueError, match="joints must be off with state='state'"):
+        BGPOConfig(state="state", joints=True)
+
+
+class Broken(Jointed):
+    def joints(self):
+        return [0.0, np.nan]
+
+
+def test_readings_are_finite_numbers_of_each_frame(made):
+    with pytest.raises(ValueError, match=r"joints\(\) returned \[0.0, nan\]: return 2 finite"):
+        jointed(Broken).simulate(TASKS).reset()
+    steps = made[2].steps
+    for joints in (steps.joints[:-1], steps.joints.double(), steps.joints * np.nan):
+        with pytest.raises(ValueError, match="joints of its steps are not finite float32 numbers"):
+            replace(steps, joints=joints)
