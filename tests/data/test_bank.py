@@ -26,7 +26,7 @@ def padded():
 
 @pytest.fixture
 def steps(padded):
-    return DemonstrationSteps.of(*padded, LENGTH)
+    return DemonstrationSteps.of(*padded, LENGTH, padded[0][..., :2])  # those are the joints
 
 
 def frames(steps, row):
@@ -35,7 +35,8 @@ def frames(steps, row):
 
 def assert_same(ours, theirs):
     for key, value in vars(ours).items():
-        assert value.equal(vars(theirs)[key]), key
+        other = vars(theirs)[key]
+        assert other is None if value is None else value.equal(other), key
 
 
 def test_no_number_is_off_by_more_than_half_a_code(steps, padded):
