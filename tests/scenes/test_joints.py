@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import BGPOConfig, RunConfig
@@ -135,9 +136,8 @@ def test_policies_and_critics_depend_on_joints(made, dot, tmp_path, refused):
     with trainer_of(made, tmp_path / "run") as trainer:
         trainer.run()
         loss = trainer.algorithm.learner.loss
-        batch = TensorDict(
-            trainer.algorithm.shown.draw(torch.zeros(2, 1, 4, dtype=torch.int64)), [2, 1, 4]
-        )
+        drawn = trainer.algorithm.shown.draw(torch.zeros(2, 1, 4, dtype=torch.int64))
+        batch = TensorDict(drawn, [2, 1, 4])
         changed = batch.clone()
         changed["latent_and_joints"][..., -1] += 1.0
         values = [loss.values("value_network", data) for data in (batch, changed)]
