@@ -314,6 +314,6 @@ def test_configurations_and_datasets_that_cannot_be_trained_on_are_refused() -> 
             replace(TINY.vae, window=window)
     with pytest.raises(ValueError, match="16 frames"):
         train(squares(8), replace(TINY, vae=replace(TINY.vae, window=16, batch_size=16)))
-    play = squares(8).set("train", torch.ones(8, dtype=torch.bool))
-    with pytest.raises(ValueError, match=r"the recorded play needs .* held_out_per_task of at"):
-        train(squares(8), play=play)
+    shown = squares(8).set("train", torch.ones(8, dtype=torch.bool))
+    with pytest.raises(ValueError, match=r"the dataset has no held-out .* held_out_per_task of at"):
+        train(shown)
