@@ -163,7 +163,8 @@ def files(tmp_path_factory) -> Path:
 
 def read_bank(path: Path) -> dict[str, torch.Tensor]:
     bank = dict(vars(DemonstrationBank.load(path, encoder_id="x")))
-    bank |= vars(bank.pop("steps"))
+    steps = vars(bank.pop("steps"))
+    bank |= {key: value for key, value in steps.items() if value is not None}
     texts = {key: bank[key] for key in ("encoder_id", "scene")}
     texts["tasks"] = ",".join(bank["tasks"])
     bank["spread"] = torch.tensor(bank["spread"])
