@@ -12,6 +12,7 @@ from bgpo_trl.algorithms.experts import ActiveGroups, Experts
 from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
 from bgpo_trl.configs import SHOWN, RLConfig
 from tests.algorithms.playing import make_batch
+from tests.helpers import through_a_file
 
 KINDS = {"actor": RLConfig(), "both": SHOWN}  # by their proposals
 every_kind = pytest.mark.parametrize("name", KINDS)
@@ -229,3 +230,29 @@ def test_a_group_that_ends_is_put_aside_and_comes_back_as_it_was(name):
     experts.play([1, 0])
     for group, tensors in kept.items():
         assert not differing(tensors_of(experts, 0, slot_of(experts, 0, group)), tensors)
+
+
+@every_kind
+def test_restored_experts_go_on_bit_for_bit(name):
+    def play(experts, steps):
+        for step in steps:
+            experts.play([step % 5, step % 3])
+            learn(experts, step)
+
+    experts, restored = make(name), make(name, seeds=(0, 1))
+    play(experts, range(13))
+    play(restored, range(4))
+    parts = {"learner": experts.learner.state_dict(), "experts": experts.state_dict()}
+    state = through_a_file(parts)
+    restored.load_state_dict(state["experts"])
+    restored.learner.load_state_dict(state["learner"])
+    for one in (experts, restored):
+        play(one, range(13, 25))
+    assert restored.active.group.equal(experts.active.group)
+    for seed in range(2):
+        for slot in range(len(experts.active.groups[seed])):
+            ours, theirs = (tensors_of(one, seed, slot) for one in (experts, restored))
+            assert not differing(ours, theirs)
+        for group in range(6):
+            ours, theirs = (policy_of(one, seed, group) for one in (experts, restored))
+            assert not differing(ours, theirs)
