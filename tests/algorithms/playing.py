@@ -1,10 +1,13 @@
 """Variants of BGPO, steps of training, and comparisons of what was learned."""
 
+import statistics
+
 import numpy as np
 import torch
 from tensordict import TensorDict
 from torch.nn.functional import layer_norm
 
+from bgpo_trl.configs import RLConfig
 from bgpo_trl.transforms import TaskSchedule
 
 # By name: state, meaning of the context, and the algorithm whose settings it has.
@@ -99,14 +102,15 @@ def perceptron(weights, x, normalize=False):
 
 
 def choice(actor, clone, critics, x, only_clone=False):
-    """The action of the better of two proposals in one state, from the weights of each network."""
+    """The action of two proposals that critics choose in one state, from each network's weights."""
     own, cloned = (perceptron(network, x).tanh() for network in (actor, clone))
 
-    def lowest(action):
-        inputs = torch.cat([x, action])
-        return min(float(perceptron(critic, inputs, normalize=True)) for critic in critics)
+    def value(critic, action):
+        return float(perceptron(critic, torch.cat([x, action]), normalize=True))
 
-    return own if not only_clone and lowest(own) > lowest(cloned) else cloned
+    gains = [value(critic, own) - value(critic, cloned) for critic in critics]
+    sure = statistics.mean(gains) > RLConfig.caution * statistics.stdev(gains)
+    return own if sure and not only_clone else cloned
 
 
 def assert_same(first, second):

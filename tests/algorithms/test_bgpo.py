@@ -182,7 +182,7 @@ def test_test_episodes_are_played_by_the_expert_of_their_demonstration(make_bgpo
     ("variant", "changes", "highest"),
     [
         # A success now, or a time-out with its bonus and a success after it, gamma as much worth.
-        ("all", {}, 0.1 + 0.97 * 1.1),
+        ("all", {}, 0.1 + 0.98 * 1.1),
         ("latent, phi", {"beta": 0.3}, 0.3 + 0.95 * 1.3),
         ("latent, b", {"beta": 0.0}, 1.0),
         ("latent, nothing", {"beta": 0.3}, 1.0),
