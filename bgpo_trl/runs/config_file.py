@@ -67,7 +67,7 @@ def read_settings(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path}{where} cannot be read ({reason}): correct it") from None
     if not isinstance(found, dict) or not all(isinstance(name, str) for name in found):
         raise ValueError(
-            f"{path} must hold settings, one `name: value` a line, as config.json does"
+            f"{path} must hold settings: put one `name: value` a line, or correct config.json"
         )
     return found
 

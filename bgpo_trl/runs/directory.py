@@ -14,6 +14,7 @@ from bgpo_trl.files.writing import make_folder, write_json
 from bgpo_trl.runs.results import COLUMNS, read_json
 
 _CSV_FILES = ("train.csv", "eval.csv")  # to which a run appends rows
+_NAMED = 5  # differing settings that an error names
 _REMEDY = "put it back as the run left it, or begin a new run in another directory"
 
 
@@ -119,11 +120,11 @@ def _compare(
         saved = {"offline_updates": 0, **saved}  # which runs before this setting lack
     if longer:
         saved = _as_grown(saved, settings)
-    differences = [
-        f"{name} is {old} there and {new} here"
-        for name, old, new in differing_settings(saved, settings)
-    ]
-    if differences:
+    differing = sorted(differing_settings(saved, settings), key=lambda one: one[0].count("."))
+    if differing:
+        differences = [f"{name} is {old} there and {new} here" for name, old, new in differing]
+        if len(differences) > _NAMED:
+            differences[_NAMED:] = [f"and {len(differences) - _NAMED} more"]
         raise ValueError(
             f"{where} holds a run with other settings ({'; '.join(differences)}): choose another "
             "run directory, or the settings and the version of the run"

@@ -101,7 +101,7 @@ def perceptron(weights, x, normalize=False):
     return hidden.relu() @ weights["mlp.layers.1.weight"] + weights["mlp.layers.1.bias"]
 
 
-def choice(actor, clone, critics, x, only_clone=False):
+def choice(actor, clone, critics, x, only_clone=False, caution=RLConfig.caution):
     """The action of two proposals that critics choose in one state, from each network's weights."""
     own, cloned = (perceptron(network, x).tanh() for network in (actor, clone))
 
@@ -109,7 +109,7 @@ def choice(actor, clone, critics, x, only_clone=False):
         return float(perceptron(critic, torch.cat([x, action]), normalize=True))
 
     gains = [value(critic, own) - value(critic, cloned) for critic in critics]
-    sure = statistics.mean(gains) > RLConfig.caution * statistics.stdev(gains)
+    sure = statistics.mean(gains) > caution * statistics.stdev(gains)
     return own if sure and not only_clone else cloned
 
 

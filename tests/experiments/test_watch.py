@@ -53,7 +53,8 @@ def test_an_episode_has_the_frames_of_the_policys_actions():
     algorithm = SimpleNamespace(max_steps=50)
     policy = SimpleNamespace(
         condition=lambda demonstration, task: shown_to.append((demonstration, task)),
-        act=lambda frame: seen.append(frame) or left.pop(0),
+        act=lambda frame, joints: seen.append(frame) or left.pop(0),
+        algorithm=SimpleNamespace(joints=None),
         config=SimpleNamespace(algorithm=algorithm, scene="nico", spread=1.0),
     )
     episode = watch.play(policy, "push_green_to_white", np.stack(frames[:2]), 3)
