@@ -1,4 +1,4 @@
-"""What the paper claims of its algorithms, tested on the rows of unfinished runs.
+"""Tests the claims of the paper on the rows of its unfinished runs.
 
 Protocol 2 of docs/protocol.md: the rows count up to the largest number of episodes that all runs
 have reached; a seed's score is the success of its tests in the last fifth of them, its area the

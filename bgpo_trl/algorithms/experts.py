@@ -161,7 +161,7 @@ class Experts:
         expert = self.find(seed, group)
         if group in self._inactive[seed]:
             return expert
-        # What an expert lacks becomes 0, so that a new group imitates with the full weight.
+        # An entry that is missing becomes 0, so that a new group imitates with the full weight.
         networks = {k: v for k, v in expert["networks"].items() if k != "n_imitated"}
         return {"networks": networks, "moments": {}}
 

@@ -80,8 +80,8 @@ def play(policy: TrainedPolicy, task: str, demonstration: NDArray, seed: int) ->
     simulation.seed(seed)
     simulation.reset(task)
     seen, views, success = [checked_frame(simulation, shape)], [_view(simulation)], False
+    columns = policy.algorithm.joints
     for _ in range(config.algorithm.max_steps):
-        columns = policy.algorithm.joints
         joints = columns and checked_numbers(simulation, "joints", columns.size)
         action = policy.act(seen[-1], joints).astype(np.float64)
         success, failure, _ = checked_step(simulation, action)
