@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from bgpo_trl.data.dataset import load_demonstrations
-from bgpo_trl.encoders import representation
+from bgpo_trl.encoders import fitting
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.files.checkpoint import load_checkpoint
 from tests.helpers import at_step, interrupt, largest_file
@@ -153,7 +153,7 @@ def test_encoder_training_is_resumed_from_the_checkpoint_before_a_damaged_one(
     learned, tmp_path, monkeypatch
 ):
     shutil.copytree(learned / "demonstrations", tmp_path / "demonstrations")
-    save, saved = representation.save_checkpoint, []
+    save, saved = fitting.save_checkpoint, []
 
     def save_or_die(*arguments):
         if len(saved) == 3:
@@ -161,7 +161,7 @@ def test_encoder_training_is_resumed_from_the_checkpoint_before_a_damaged_one(
         saved.append(save(*arguments))
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(representation, "save_checkpoint", save_or_die)
+        patch.setattr(fitting, "save_checkpoint", save_or_die)
         train_small_encoders(tmp_path)
     saved[-1].write_bytes(saved[-1].read_bytes()[:-1])
     with pytest.warns(UserWarning, match=f"{saved[-1].name} is damaged"):

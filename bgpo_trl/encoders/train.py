@@ -15,17 +15,11 @@ from tensordict import TensorDictBase
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders.fitting import Log, retrain_inverse, train_representation
 from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.probes import complaints, probe
-from bgpo_trl.encoders.representation import (
-    Log,
-    Representation,
-    retrain_inverse,
-    save_representation,
-    split,
-    train_representation,
-)
+from bgpo_trl.encoders.representation import Representation, save_representation, split
 from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.files.writing import check_folder, make_folder
 from bgpo_trl.scenes import Scene, find_scene

@@ -9,12 +9,12 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from bgpo_trl.encoders.fitting import train_representation
 from bgpo_trl.encoders.representation import (
     encode_frames,
     load_representation,
     save_representation,
     split,
-    train_representation,
     valid_frames,
     valid_steps,
 )

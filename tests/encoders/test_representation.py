@@ -17,16 +17,15 @@ from bgpo_trl.configs import (
     SequenceAutoencoderConfig,
     VAEConfig,
 )
+from bgpo_trl.encoders.fitting import retrain_inverse, train_representation
 from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.probes import _probe_reconstruction, probe
 from bgpo_trl.encoders.representation import (
     Representation,
     load_representation,
     mean_frame,
-    retrain_inverse,
     save_representation,
     split,
-    train_representation,
     valid_frames,
 )
 from bgpo_trl.encoders.train import train_encoders
