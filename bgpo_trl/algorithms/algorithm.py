@@ -12,9 +12,9 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.func import functional_call
-from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
-from bgpo_trl.algorithms.environments import training_env
+from bgpo_trl.algorithms.environments import beside_joints, clip, training_env
 from bgpo_trl.algorithms.proposal_trials import ProposalTrials
 from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import AlgorithmConfig, BGPOConfig
@@ -374,9 +374,11 @@ class Algorithm(ABC):
                 "record or write demonstrations with 'joints' and make the bank again (`bgpo "
                 "bank`), or set joints to False"
             )
-        scaled = (steps.joints - torch.tensor(columns.center)) / torch.tensor(columns.scale)
-        limit = self.config.state_limit
-        return scaled if limit is None else scaled.clamp(-limit, limit)
+        # Scaled and bounded as in episodes; latents of none.
+        frames = len(steps.joints)
+        seen = TensorDict({"latent": torch.empty(frames, 0), "joints": steps.joints}, [frames])
+        observe = Compose(*beside_joints(columns), *clip(self.config))
+        return observe(seen)[self.config.observed]
 
     def sample(
         self,
