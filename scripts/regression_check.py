@@ -33,7 +33,7 @@ RUNS = {
     "paper": f"continual.py --algorithm bgpo-paper {_SHORT}",
 }
 """Arguments of each run, by its name."""
-_TABLES = ("train.csv", "eval.csv", "final.csv", "gwr.csv")
+_TABLES = ("train.csv", "eval.csv", "final.csv")
 
 
 def digest_of(run: Path) -> dict[str, Any]:
