@@ -8,10 +8,9 @@ from tensordict import TensorDict
 
 from bgpo_trl.algorithms import entry
 from bgpo_trl.files.checkpoint import load_checkpoint
-from bgpo_trl.runs.directory import check_settings
 from bgpo_trl.training import Trainer
 from tests.algorithms.playing import assert_same
-from tests.helpers import edit, interrupt, rows
+from tests.helpers import interrupt, rows
 from tests.test_training import assert_same_run
 
 pytestmark = pytest.mark.usefixtures("easy_world")
@@ -134,13 +133,3 @@ def test_an_interrupted_run_equals_one_that_is_not(begin, offline_config, tmp_pa
 def test_algorithms_without_demonstrations_to_replay_refuse(make_config, name):
     with pytest.raises(ValueError, match="offline_updates must be 0"):
         make_config(name=name, offline_updates=1)
-
-
-def test_runs_from_before_the_setting_can_be_resumed(begin, make_config, tmp_path):
-    with begin(tmp_path, make_config(episodes=2)) as trainer:
-        trainer.run()
-        settings = load_checkpoint(tmp_path / "checkpoint")["settings"]
-    edit(tmp_path / "config.json", offline_updates=None)
-    check_settings(tmp_path, settings)
-    with pytest.raises(ValueError, match="offline_updates is 0 there and 5 here"):
-        check_settings(tmp_path, {**settings, "offline_updates": 5})

@@ -116,8 +116,6 @@ def _compare(
     longer: bool,
 ) -> None:
     """Raise ``ValueError`` if settings differ, beside length and further tasks if ``longer``."""
-    if "offline_updates" in settings:
-        saved = {"offline_updates": 0, **saved}  # which runs before this setting lack
     if longer:
         saved = _as_grown(saved, settings)
     differing = sorted(differing_settings(saved, settings), key=lambda one: one[0].count("."))
