@@ -377,7 +377,7 @@ class Algorithm(ABC):
         # Scaled and bounded as in episodes; latents of none.
         frames = len(steps.joints)
         seen = TensorDict({"latent": torch.empty(frames, 0), "joints": steps.joints}, [frames])
-        observe = Compose(*beside_joints(columns), *clip(self.config))
+        observe = Compose([*beside_joints(columns), *clip(self.config)])
         return observe(seen)[self.config.observed]
 
     def sample(
