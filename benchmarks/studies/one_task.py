@@ -33,7 +33,6 @@ from torch.func import functional_call
 from torchrl.envs import Compose, StepCounter, TransformedEnv
 
 from bgpo_trl.algorithms.environments import clip, encode
-from bgpo_trl.algorithms.proposal_trials import ProposalTrials
 from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
 from bgpo_trl.configs import SHOWN, BGPOConfig, RLConfig
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
@@ -103,9 +102,6 @@ class Trial:
         )
         self.noise = [generators([seed], f"exploration {i}")[0] for i in range(N_SIMULATIONS)]
         self.alone = torch.zeros(N_SIMULATIONS, dtype=torch.bool)
-        self.trials = ProposalTrials(
-            1, clone_episodes=rl.clone_episodes, clone_share=rl.clone_share
-        )
         self.n_updates = 0
         self.rows: list[dict[str, object]] = []
 
@@ -203,7 +199,9 @@ class Trial:
                 episodes.append((steps[row], bool(transition["next", "success"][row])))
                 steps[row] = []
                 if learn:
-                    self.alone[row] = rl.proposals == "both" and self.trials.is_clones(n_begun)
+                    later = n_begun - rl.clone_episodes
+                    due = rl.clone_share > 0 and later % round(1 / rl.clone_share) == 0
+                    self.alone[row] = rl.proposals == "both" and (later < 0 or due)
                 n_begun += 1
             if not learn or len(self.replay) * N_SIMULATIONS < rl.warmup_steps:
                 continue

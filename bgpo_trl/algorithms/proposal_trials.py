@@ -24,9 +24,10 @@ class ProposalTrials:
     RL makes a policy faster and better than its demonstrations, but at first the critics choose
     badly. A robot in use should not pay for that. Therefore
 
-    1. the clone alone plays the first ``clone_episodes`` training episodes of a group, and then one
-       in ``1 / clone_share``; the critics choose in all others, since they learn only from what
-       they have chosen;
+    1. the clone alone plays the first ``clone_episodes`` training episodes of a group, then every
+       second one while it is better than the critics' choice (2), and otherwise one in
+       ``1 / clone_share``; the critics choose in all others, since they learn only from what they
+       have chosen;
     2. outside training, the critics choose if what they chose has succeeded at least as often as
        the clone alone, in the latest training episodes of each, about 33. Else, and before 20
        episodes of theirs, the clone acts.
@@ -62,16 +63,14 @@ class ProposalTrials:
     def begin(self, seed: int, group: int) -> bool:
         """Return whether the clone alone plays the training episode that begins."""
         record = self._groups[seed].setdefault(group, _Record())
-        alone = self.is_clones(record.episodes)
+        alone = record.episodes < self.clone_episodes
+        if not alone:
+            half = self.clone_is_better(seed, group)
+            record.due += max(0.5, self.clone_share) if half else self.clone_share
+            alone = record.due > 1 - 1e-6
+            record.due -= alone
         self._playing[seed] = group, alone
         return alone
-
-    def is_clones(self, episode: int) -> bool:
-        """Return whether the clone plays a group's training episode, counted from 0."""
-        later = episode - self.clone_episodes
-        # One in 1 / clone_share of the later episodes, evenly spread.
-        due = int((later + 1) * self.clone_share) > int(later * self.clone_share)
-        return later < 0 or due
 
     def end(self, seed: int, success: bool, *, group: int, demonstration: int = 0) -> None:
         """Count the end of a training episode of a seed.
@@ -93,7 +92,9 @@ class ProposalTrials:
     def clone_is_better(self, seed: int, group: int) -> bool:
         """Return whether the clone has succeeded more often than what the critics chose."""
         record = self._groups[seed].get(group, _Record())
-        return len(record.choice) < _ENOUGH or _rate(record.choice) < _rate(record.clone)
+        # Sums of equal rates may differ in their last digit.
+        worse = _rate(record.choice) < _rate(record.clone) - 1e-9
+        return len(record.choice) < _ENOUGH or worse
 
     def follow(self, seed: int, groups: Sequence[int], group_of: Sequence[int]) -> None:
         """Forget what does not fit the groups of today.
@@ -128,6 +129,7 @@ class _Record:
     """Training episodes of a group, and the latest outcomes of the clone and the choice."""
 
     episodes: int = 0
+    due: float = 0.0  # what is due to the clone of the later ones, less what it has played
     clone: list[Outcome] = field(default_factory=list)
     choice: list[Outcome] = field(default_factory=list)
 

@@ -125,12 +125,13 @@ class Learner:
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Return the losses ``[S, E]`` to minimize on transitions ``[S, E, B]``.
 
-        Those of actor and clone are due in one of ``policy_delay`` updates.
+        That of the actor is due in one of ``policy_delay`` updates.
         """
         if self.config.proposals == "clone":
             return {"loss_clone": self.loss.loss_clone(batch)}
         if (int(self.loss.n_calls) + 1) % self.config.policy_delay:
-            return {"loss_value": self.loss.loss_value(batch)[0]}
+            clone = {"loss_clone": self.loss.loss_clone(batch)} if self.loss.has_clone else {}
+            return {"loss_value": self.loss.loss_value(batch)[0], **clone}
         return {str(k): v for k, v in self.loss(batch).items() if str(k).startswith("loss_")}
 
     def clear_momentum(self, index: int) -> None:

@@ -76,7 +76,7 @@ class RLConfig(Settings):
     update_every: int = 1
     """Environment steps of each seed per update (1 in Alg. 1)."""
     policy_delay: int = 1
-    """Updates of the critics per update of actor and clone."""
+    """Updates of the critics, and of a clone, per update of the actor."""
     caution: float = 1.0
     """With both proposals, standard deviations of the critics' gains by which their mean must be
     above 0 for the actor's proposal to be taken (`ProposalPolicy`)."""
@@ -125,7 +125,6 @@ SHOWN = RLConfig(
     learning_rate=3e-4,
     gamma=0.98,
     noise=0.1,
-    update_every=2,
     policy_delay=2,
     clone_share=0.1,
 )

@@ -34,35 +34,39 @@ def test_the_clone_has_its_share_of_training_and_tests_until_the_choice_is_as_go
     def make():
         return ProposalTrials(2, clone_episodes=first, clone_share=share)
 
+    def rate(of_one):
+        weight = 0.97 ** np.arange(len(of_one))[::-1]
+        return weight @ of_one / weight.sum() if of_one else 0.0
+
     trials, rng = make(), np.random.default_rng(seed)
-    outcomes, later = {True: [], False: []}, []
+    outcomes, later, owed = {True: [], False: []}, 0, 0.0
     for number in range(n_episodes):
+        better = trials.clone_is_better(1, 7)
+        if len(outcomes[False]) < 20 or abs(rate(outcomes[True]) - rate(outcomes[False])) > 1e-9:
+            expected = len(outcomes[False]) < 20 or rate(outcomes[False]) < rate(outcomes[True])
+            assert better == expected
         alone = trials.begin(1, 7)
         assert trials.only_clone == [False, alone]
         assert alone or number >= first
-        later += [alone] if number >= first else []
-        assert sum(later) == pytest.approx(share * len(later), abs=1)  # at any time
+        if number >= first:
+            owed += max(0.5, share) if better else share
+            later += alone
+            assert later == pytest.approx(owed, abs=1)  # at any time
         outcomes[alone].append(rng.random() < rates[alone])
         trials.end(1, outcomes[alone][-1], group=7)
         if restored:
             state, trials = trials.state_dict(), make()
             trials.load_state_dict(state)
-    means = {}
-    for alone, of_both in outcomes.items():
-        weight = 0.97 ** np.arange(len(of_both))[::-1]
-        means[alone] = weight @ of_both / weight.sum() if of_both else 0.0
-    if len(outcomes[False]) < 20 or abs(means[True] - means[False]) > 1e-9:
-        expected = len(outcomes[False]) < 20 or means[False] < means[True]
-        assert trials.clone_is_better(1, 7) == expected
     assert trials.clone_is_better(0, 7) and trials.clone_is_better(1, 3)  # of others, nothing
 
 
 def test_the_rules_by_hand():
     trials = ProposalTrials(1, clone_episodes=3, clone_share=0.25)
-    assert play(trials, [True] * 11) == [True] * 3 + [False, False, False, True] * 2
-    assert play(trials, [True] * 17).count(False) == 13 and trials.clone_is_better(0, 7)  # 19
-    play(trials, [True])
-    assert not trials.clone_is_better(0, 7)  # 20, and as good
+    # As long as the critics' choice has not played 20 episodes, the clone plays every second one.
+    assert play(trials, [True] * 41) == [True] * 3 + [False, True] * 19
+    assert trials.clone_is_better(0, 7)
+    assert play(trials, [True]) == [False] and not trials.clone_is_better(0, 7)  # 20, and as good
+    assert play(trials, [True] * 11) == [False, True] + [False, False, False, True] * 2 + [False]
     while trials.begin(0, 7):
         trials.end(0, True, group=7)
     trials.end(0, False, group=7)

@@ -34,7 +34,7 @@ def changed(before, after):
 
 
 @every_kind
-def test_every_update_is_one_of_the_critics_and_every_other_one_of_the_policies(name):
+def test_every_update_is_one_of_critics_and_clone_and_every_other_one_of_the_actor(name):
     """By default; a clone alone has no critics, and DDPG updates its actor always."""
     learner = make(name)
     for update in range(1, 7):
@@ -42,7 +42,7 @@ def test_every_update_is_one_of_the_critics_and_every_other_one_of_the_policies(
         told = learner.learn(make_batch(2, 1, 16, seed=update))
         now = changed(before, weights(learner))
         due = name != "both" or update % 2 == 0
-        parts = {"actor": "av", "clone": "c", "both": "avc" if due else "v"}[name]
+        parts = {"actor": "av", "clone": "c", "both": "avc" if due else "vc"}[name]
         assert now == {key for key in before if key[0] in parts}
         moved = {key.removeprefix("target_")[0] for key in changed(slow, targets(learner))}
         followed = "" if name == "clone" else "v" if name == "both" and update == 1 else "av"
