@@ -17,7 +17,7 @@ from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 from bgpo_trl.algorithms.environments import beside_joints, clip, training_env
 from bgpo_trl.algorithms.proposal_trials import ProposalTrials
 from bgpo_trl.algorithms.rl import Learner
-from bgpo_trl.configs import AlgorithmConfig, BGPOConfig
+from bgpo_trl.configs import AlgorithmConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
 from bgpo_trl.data.replay import GroupReplay
@@ -37,7 +37,7 @@ def read_joints(config: AlgorithmConfig, scene: Scene) -> StateColumns | None:
     Raises:
         ValueError: If they are to read joints that the scene does not have.
     """
-    if not (isinstance(config, BGPOConfig) and config.joints):
+    if not config.joints:
         return None
     if scene.joints is None:
         raise ValueError(

@@ -49,7 +49,7 @@ class DistNLL(TaskAlgorithm):
             MultiHeadActor,
             self.state_size,
             self.scene.action_size,
-            in_keys=[self.config.state],
+            in_keys=[self.config.observed],
             hidden_sizes=self.config.rl.hidden_sizes,
         )
         self.students = [network(generator=stream).to(self.device) for stream in streams]
@@ -65,7 +65,7 @@ class DistNLL(TaskAlgorithm):
         self.test_actor = Actor(
             self.state_size,
             self.scene.action_size,
-            in_keys=[self.config.state],
+            in_keys=[self.config.observed],
             hidden_sizes=self.config.rl.hidden_sizes,
         ).to(self.device)
 
@@ -96,7 +96,7 @@ class DistNLL(TaskAlgorithm):
         rows = torch.tensor([tasks]).unsqueeze(-1).expand(-1, -1, self.config.samples)
         drawn = self.replay.sample(rows, seeds=[index]).squeeze(0)
         # The weights are 0 where the replay holds no transition of a task any more.
-        batch = self.to_device(drawn.select(self.config.state, "priority_weight"))
+        batch = self.to_device(drawn.select(self.config.observed, "priority_weight"))
         alone = [self.proposals and self.proposals.clone_is_better(index, t) for t in tasks]
         seed = torch.full((len(tasks),), index, device=self.device)
         with torch.no_grad():

@@ -33,7 +33,7 @@ class TaskAlgorithm(Algorithm):
         super().__init__(config, **arguments)
         self.spec = LearnerSpec(
             seeds=self.seeds,
-            in_keys=[config.state],
+            in_keys=[config.observed],
             in_features=self.state_size,
             action_size=self.scene.action_size,
             return_bounds=(0.0, 1.0),

@@ -138,6 +138,9 @@ class AlgorithmConfig(Settings):
     state: Literal["latent", "state"] = "latent"
     """Observation of the policy: the latent z of a frame (Alg. 1) or, for
     the study of privileged information, the ground truth."""
+    joints: bool = False
+    """Whether policies and critics read the robot's joints beside the latent, in a scene that has
+    them (`Scene.joints`). Ours."""
     max_steps: int = 50
     """Steps of an episode (Sec. IV-B)."""
     timeouts_bootstrap: bool = True
@@ -156,8 +159,8 @@ class AlgorithmConfig(Settings):
 
     @property
     def observed(self) -> str:
-        """Entry that policies read of the robot: the state, alone or with more beside it."""
-        return self.state
+        """Entry that policies read of the robot; latent and joints side by side are one entry."""
+        return "latent_and_joints" if self.joints else self.state
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -166,6 +169,8 @@ class AlgorithmConfig(Settings):
             self,
             ("demonstration_share", 0 <= share < 1, "at least 0 and below 1"),
         )
+        beside = self.state == "latent" or not self.joints
+        check(self, ("joints", beside, "off with state='state', which tells more"))
         shown = share > 0 or not self.rl.imitates
         check(
             self,
@@ -292,14 +297,6 @@ class BGPOConfig(AlgorithmConfig):
     group_evidence: float = 1.0
     """Depth of the valley of density between two groups, in multiples of what chance explains
     (`density_clusters`). Ours."""
-    joints: bool = False
-    """Whether policies and critics read the robot's joints beside the latent, in a scene that has
-    them (`Scene.joints`). Ours."""
-
-    @property
-    def observed(self) -> str:
-        """See `AlgorithmConfig`; latent and joints side by side are one entry."""
-        return "latent_and_joints" if self.joints else self.state
 
     @property
     def grouped(self) -> bool:
@@ -314,8 +311,6 @@ class BGPOConfig(AlgorithmConfig):
         at_least(self, 4, "group_size")
         holds = self.group_balanced_replay or not self.experts
         check(self, ("group_balanced_replay", holds, "set where there are experts"))
-        beside = self.state == "latent" or not self.joints
-        check(self, ("joints", beside, "off with state='state', which tells more"))
         _check_played(self, self.expert_batch_size if self.experts else self.rl.batch_size)
 
 

@@ -157,6 +157,24 @@ def test_policies_and_critics_depend_on_joints(made, dot, tmp_path, refused):
     assert "left: " in watch(WatchArguments(run=tmp_path / "run"))
 
 
+@pytest.mark.parametrize("name", ["dist-nll", "maml", "ewc"])
+def test_baselines_read_joints_too(made, dot, tmp_path, name):
+    algorithm = replace(ALGORITHMS[name].config, max_steps=12, joints=True)
+    rl = replace(algorithm.rl, warmup_steps=12, batch_size=8, hidden_sizes=(16,))
+    changes = {} if name == "ewc" else {"task_batch_size": 8}
+    algorithm = replace(algorithm, rl=rl, **changes)
+    config = replace(config_of(), name=name, algorithm=algorithm)
+    with trainer_of(made, tmp_path / "run", config) as trainer:
+        trainer.run()
+    policy, frame = load_run(tmp_path / "run"), np.full((16, 24, 3), 90, np.uint8)
+    differ = []  # Dist-NLL has no policy of a task that was hardly played.
+    for task in TASKS:
+        policy.condition(np.stack([frame] * 4), task=task)
+        read = [policy.act(frame, joints) for joints in ([0.5, 11.0], [-0.5, 9.0])]
+        differ.append(not np.array_equal(*read))
+    assert any(differ)
+
+
 def test_policies_without_joints_are_as_before(made, dot, tmp_path):
     without = replace(config_of(), algorithm=replace(config_of().algorithm, joints=False))
     with trainer_of(made, tmp_path / "run", without) as trainer:
