@@ -45,7 +45,7 @@ class ProposalTrials:
     Examples:
         >>> trials = ProposalTrials(1, clone_episodes=2, clone_share=0.25)
         >>> [(trials.begin(0, group=7), trials.end(0, success=True, group=7))[0] for _ in range(8)]
-        [True, True, False, False, False, True, False, False]
+        [True, True, False, True, False, True, False, True]
         >>> trials.clone_is_better(0, group=7)  # the critics have hardly been tried
         True
     """
