@@ -2,8 +2,9 @@
 
 Eight simulations share one learner, so that a trial of 1,000 episodes takes minutes. The N
 demonstrations are there from the start, with frames encoded and actions inferred as in every run.
-A clone imitates them for 3,000 updates before the first episode. Tests are of the same 100 new
-starts each time, without noise.
+A clone imitates them for 3,000 updates before the first episode, and plays the first
+``clone_episodes`` episodes and one in ``1 / clone_share`` later ones. Tests are of the same 100
+new starts each time, without noise.
 
     python benchmarks/studies/one_task.py --task grasp_glass --demonstrations 30
     python benchmarks/studies/one_task.py --rl.critics 2 --rl.gamma 0.99

@@ -85,7 +85,7 @@ class RLConfig(Settings):
     choose."""
     clone_share: float = 0.25
     """With both proposals, share of later training episodes that the clone plays alone, so that
-    what it achieves is known (`ProposalTrials`)."""
+    what it achieves is known; at least a half while it is the better one (`ProposalTrials`)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
