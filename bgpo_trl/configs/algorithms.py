@@ -125,6 +125,7 @@ SHOWN = RLConfig(
     learning_rate=3e-4,
     gamma=0.98,
     noise=0.1,
+    update_every=2,
     policy_delay=2,
     clone_share=0.1,
 )
