@@ -1,14 +1,15 @@
 """The claims of the paper are tested on the rows of its unfinished runs.
 
-Protocol 2 of docs/protocol.md: the rows count up to the largest number of episodes that all runs
-have reached; a seed's score is the success of its tests in the last fifth of them, its area the
-mean over all its tests.
+Protocols 2 and 3 of docs/protocol.md: the rows count up to the largest number of episodes that all
+runs have reached; a seed's score is the success of its tests in the last fifth of them, its area
+the mean over all its tests. Runs of one arm are in folders of one name, with the seed after it.
 
     python benchmarks/studies/paper_claims.py benchmarks/results/paper-quarter
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -31,22 +32,22 @@ N_RANDOM = 300
 
 @dataclass(frozen=True)
 class ClaimsArguments:
-    """Runs of equal conditions in one folder, of as many algorithms and seeds as there are."""
+    """Runs of equal conditions in one folder, of as many arms and seeds as there are."""
 
     runs: Annotated[Path, tyro.conf.Positional]
     """Folder of the runs; ``claims.md`` and ``claims.png`` are written to it."""
 
 
 def runs_of(folder: Path) -> tuple[dict[str, Run], int]:
-    """Return the runs by algorithm, up to the episode that all have reached, and this episode.
+    """Return the runs by arm, up to the episode that all have reached, and this episode.
 
     Raises:
         ValueError: If there is no run, one is damaged or without training episodes, conditions
-            differ, or runs of an algorithm cannot be joined.
+            differ, or runs of an arm cannot be joined.
     """
     read = [read_run(directory) for directory in run_directories([folder])]
     for run in read:
-        check_conditions(read[0], run)
+        check_conditions(read[0], run, ["episodes"])
         if run.training is None or run.training.empty:
             raise ValueError(f"{run.directory} has no training episodes: let the run begin")
     played = [run.training for run in read if run.training is not None]
@@ -55,9 +56,9 @@ def runs_of(folder: Path) -> tuple[dict[str, Run], int]:
         replace(run, tests=run.tests[run.tests.episode <= reached], training=rows)
         for run, rows in zip(read, (r[r.episode <= reached] for r in played), strict=True)
     ]
-    runs = {run.algorithm: run for run in joined(cut)}
+    runs = {re.sub(r"-\d+$", "", run.directories[0].name): run for run in joined(cut)}
     if sum(len(run.directories) for run in runs.values()) < len(cut):
-        raise ValueError(f"{folder} has runs of an algorithm with other settings: keep one setting")
+        raise ValueError(f"{folder} has runs of an arm with other settings: keep one setting")
     return runs, reached
 
 
@@ -74,7 +75,7 @@ def paper_claims(arguments: ClaimsArguments) -> str:
     chance = evaluate_random_policy(tasks=first.tasks, episodes=N_RANDOM, seed=0, spread=spread)
     scores, areas, n_tests = {}, {}, 0
     table: Table = [
-        ["algorithm", "score, %", "seeds", "area, %", *first.tasks, "steps of a success", "nodes"]
+        ["arm", "score, %", "seeds", "area, %", *first.tasks, "steps of a success", "nodes"]
     ]
     for name, run in runs.items():
         late = run.tests[run.tests.episode > 0.8 * reached]
@@ -113,7 +114,8 @@ Tasks in percent. Nodes of GWR-B at the end.
 """
     write_whole(folder / "claims.md", text)
     by_task = dict(zip(first.tasks, chance.tolist(), strict=True))
-    runs[first.algorithm] = replace(first, summary={**first.summary, "random_success": by_task})
+    arm = next(iter(runs))
+    runs[arm] = replace(first, summary={**first.summary, "random_success": by_task})
     save_figure(plot_success_curves(runs, window=first.eval_every), folder / "claims.png", dpi=150)
     return text
 

@@ -59,6 +59,20 @@ def test_rows_count_up_to_the_episode_that_all_runs_have_reached(tmp_path, monke
     assert cells(contrasts)[1][2].startswith("+70.0")
 
 
+def test_arms_of_one_algorithm_are_told_apart_by_their_folders(tmp_path):
+    for arm, settings in (("slow", {"beta": 0.1}), ("without-bonus", {"beta": 0.0})):
+        write(tmp_path, arm, 0, 100, 0.5)
+        config = tmp_path / f"{arm}-0" / "config.json"
+        changed = {"name": "slow", "algorithm": settings, "episodes": len(arm)}
+        config.write_text(json.dumps(json.loads(config.read_text()) | changed))
+    runs, reached = paper_claims.runs_of(tmp_path)
+    assert [*runs] == ["slow", "without-bonus"]
+    assert reached == 100
+    write(tmp_path, "slow", 1, 100, 0.5)
+    with pytest.raises(ValueError, match="an arm with other settings"):
+        paper_claims.runs_of(tmp_path)
+
+
 def test_runs_of_other_conditions_are_refused(tmp_path):
     write(tmp_path, "slow", 0, 20, 0.5)
     write(tmp_path, "fast", 0, 20, 0.5)
