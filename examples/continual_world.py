@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from bgpo_trl.scenes import SCENES, Outcome, SimulationEnv
 from examples.meta_world import ACTION_REPEAT, METAWORLD, MetaWorld, World
-from examples.meta_world_frames import FRAME_SHAPE
 
 CW10 = (
     "hammer",
@@ -88,8 +87,7 @@ class ContinualWorld(MetaWorld):
 
 def make_env(tasks: Sequence[str], **arguments: Any) -> SimulationEnv:
     """Return simulations of some tasks; arguments as for `SimulationEnv`."""
-    sizes = {"frame_shape": FRAME_SHAPE, "action_size": 4, "state_size": 7}
-    return SimulationEnv(partial(ContinualWorld, {}), tasks, **sizes, **arguments)
+    return SimulationEnv(partial(ContinualWorld, {}), tasks, **arguments)
 
 
 SCENES["cw10"] = replace(

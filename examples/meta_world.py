@@ -184,8 +184,7 @@ def demonstrator(simulation: Simulation, task: str, seed: int) -> Callable[[], N
 
 def make_env(tasks: Sequence[str], **arguments: Any) -> SimulationEnv:
     """Return simulations of some tasks; arguments as for `SimulationEnv`."""
-    sizes = {"frame_shape": FRAME_SHAPE, "action_size": 4, "state_size": 7}
-    return SimulationEnv(partial(MetaWorld, {}), tasks, **sizes, **arguments)
+    return SimulationEnv(partial(MetaWorld, {}), tasks, **arguments)
 
 
 METAWORLD = SCENES["metaworld"] = Scene(

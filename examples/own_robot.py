@@ -25,7 +25,6 @@ from bgpo_trl.scenes import SCENES, Outcome, RobotEnv, Scene, Simulation
 from bgpo_trl.training import Trainer
 
 OUT, TASKS = Path("runs/own-robot"), ("left", "right")
-SHAPE = {"frame_shape": (16, 32), "action_size": 1}
 LARGEST_STEP = 0.2  # limit of the motor; an action of 1 asks for a step of 0.3
 
 
@@ -82,10 +81,11 @@ RAIL = SCENES["rail"] = Scene(
     setup={"camera": "over the rail, 16 x 32", "units": "an action of 1 moves by 0.3"},
     tasks=TASKS,
     default_tasks=TASKS,
-    make_env=partial(RobotEnv, PhysicalRobot, **SHAPE),
+    make_env=partial(RobotEnv, PhysicalRobot),
+    frame_shape=(16, 32),
+    action_size=1,
     max_steps=12,
     rate=5.0,
-    **SHAPE,
 )
 
 

@@ -110,16 +110,16 @@ def demonstrate(simulation, task, seed):
     return act
 
 
-SHAPE = {"frame_shape": (48, 48), "action_size": 2}
 REACHER = SCENES["reacher"] = Scene(
     name="reacher",
     version="1",  # Change it when frames or movements change: old data no longer fit.
     tasks=TASKS,
     default_tasks=TASKS,
-    make_env=partial(SimulationEnv, Reacher, **SHAPE),
+    make_env=partial(SimulationEnv, Reacher),
+    frame_shape=(48, 48),
+    action_size=2,
     max_steps=25,
     demonstrator=demonstrate,
-    **SHAPE,
 )
 
 if __name__ == "__main__":

@@ -46,19 +46,21 @@ def load_pretrained(
 def default_weights(tasks: Sequence[str] | None = None, *, scene: Scene | str = "nico") -> Path:
     """Return the path of the encoders that come with a scene, for some of its tasks.
 
-    For NICO, these are the encoders of eight tasks if one of the suite's further five is among
-    them, and otherwise, also for custom tasks, those of the paper's three.
+    These are the first with the most of the tasks. For NICO, they are the encoders of eight tasks
+    if one of the suite's further five is among them, and otherwise, also for custom tasks, those of
+    the paper's three.
 
     Raises:
         ValueError: If none come with the scene.
     """
     scene = find_scene(scene)
-    if scene.weights is None:
+    if not scene.weights:
         raise ValueError(
             f"no encoders come with the scene {scene.name!r}: name a file (--encoders, --weights "
             "in the commands of bgpo_trl.encoders), or let a run train some (--train-encoders)"
         )
-    return scene.weights.choose(scene.default_tasks if tasks is None else tasks)
+    wanted = {*(scene.default_tasks if tasks is None else tasks)}
+    return max(scene.weights, key=lambda path: len(wanted.intersection(scene.weights[path])))
 
 
 def bank_path(weights: Path) -> Path:
@@ -68,8 +70,7 @@ def bank_path(weights: Path) -> Path:
 
 def find_weights(identity: str | None, scene: Scene | str = "nico") -> Path | None:
     """Return the path of the encoders with an identity that come with a scene; None if none do."""
-    weights = find_scene(scene).weights
-    files = () if weights is None else weights.files
+    files = find_scene(scene).weights
     return next((path for path in files if identity == _identity(path)), None)
 
 

@@ -9,7 +9,6 @@ from bgpo_trl.scenes.scene import (
     Scene,
     Simulation,
     StateColumns,
-    Weights,
     find_scene,
 )
 
@@ -35,6 +34,5 @@ __all__ = [
     "Simulation",
     "SimulationEnv",
     "StateColumns",
-    "Weights",
     "find_scene",
 ]

@@ -15,18 +15,16 @@ import torch
 from dm_env import TimeStep
 from numpy.typing import NDArray
 
-from bgpo_trl.scenes.scene import Observation, Outcome, Scene, Simulation, StateColumns, Weights
+from bgpo_trl.scenes.scene import Observation, Outcome, Scene, Simulation, StateColumns
 from bgpo_trl.scenes.simulation import SimulationEnv
 from bgpo_trl.seeding import random_state, set_random_state
 from suites import nico
-from suites.nico.base import STATE_CENTER, STATE_SCALE, STATE_SIZE, Environment
+from suites.nico.base import STATE_CENTER, STATE_SCALE, Environment
 from suites.nico.demonstrator import Demonstrator
 from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer
 
-__all__ = ["FRAME_SHAPE", "NICO", "NicoEnv", "NicoSimulation"]
+__all__ = ["NICO", "NicoEnv", "NicoSimulation"]
 
-
-FRAME_SHAPE = (FRAME_HEIGHT, FRAME_WIDTH)
 _ROOM = (180, 70, 600, 350)  # (pixels) crop of the 640x480 room view to NICO and the table
 
 
@@ -138,7 +136,7 @@ class NicoEnv(SimulationEnv):
         tasks: Names of the tasks, in the order of their presentation.
         spread: Share of the whole range of start states, from 0 (nominal places) to 1.
         observation: ``"pixels"``, ``"state"`` or ``"both"``.
-        **options: ``batch_size``, ``seed`` and ``threads`` of `SimulationEnv`.
+        **options: ``batch_size``, ``seed`` and ``threads`` of `SimulationEnv`; sizes as of `NICO`.
 
     Raises:
         ValueError: If a task is unknown or named twice, the spread is out of range, or as for
@@ -160,15 +158,8 @@ class NicoEnv(SimulationEnv):
     ) -> None:
         self._spread = spread
         self._renderer: FrameRenderer | None = None
-        super().__init__(
-            self._make,
-            tasks,
-            frame_shape=FRAME_SHAPE,
-            action_size=4,
-            state_size=STATE_SIZE,
-            observation=observation,
-            **options,
-        )
+        options = {**NICO.sizes, **options}
+        super().__init__(self._make, tasks, observation=observation, **options)
 
     def _make(self) -> NicoSimulation:
         simulation = self._simulation()
@@ -210,15 +201,6 @@ _PAPER, _EIGHT = (
 )
 
 
-def _weights_for(tasks: Sequence[str]) -> Path:
-    """Return the encoders of eight tasks if one of the suite's further five is among them.
-
-    Otherwise, also for custom tasks, return those of the paper's three.
-    """
-    further = set(nico.ALL_TASKS) - set(nico.PAPER_TASKS)
-    return _PAPER if further.isdisjoint(tasks) else _EIGHT
-
-
 def _modules(tasks: Sequence[str]) -> Mapping[str, str]:
     return {name: nico.TASKS[name].__module__ for name in tasks if name not in nico.ALL_TASKS}
 
@@ -230,7 +212,7 @@ NICO = Scene(
     default_tasks=nico.PAPER_TASKS,
     own_tasks=nico.ALL_TASKS,
     make_env=NicoEnv,
-    frame_shape=FRAME_SHAPE,
+    frame_shape=(FRAME_HEIGHT, FRAME_WIDTH),
     action_size=4,
     max_steps=50,
     rate=5.0,
@@ -248,7 +230,7 @@ NICO = Scene(
         },
         valid=_objects_on_table,
     ),
-    weights=Weights(files=(_PAPER, _EIGHT), choose=_weights_for),
+    weights={_PAPER: nico.PAPER_TASKS, _EIGHT: nico.ALL_TASKS},
     modules=_modules,
 )
 """NICO at the table, the scene of the paper."""

@@ -24,7 +24,6 @@ __all__ = [
     "Scene",
     "Simulation",
     "StateColumns",
-    "Weights",
     "checked_frame",
     "checked_numbers",
     "checked_step",
@@ -208,19 +207,6 @@ class StateColumns:
         return len(self.center)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Weights:
-    """Encoders that come with a scene, each with a bank beside it, see `bank_path`.
-
-    Attributes:
-        files: Their files.
-        choose: Function from names of tasks to the file that serves them.
-    """
-
-    files: Sequence[Path]
-    choose: Callable[[Sequence[str]], Path]
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
     """A robot and its tasks: all that experiments know about a simulation.
@@ -239,9 +225,10 @@ class Scene:
         tasks: Names of all tasks; may grow while the program runs.
         default_tasks: Names of the tasks of an experiment by default.
         own_tasks: Names of the tasks that come with the scene; the default ones if None.
-        make_env: Constructor of the environment, see `simulate`. It is `SimulationEnv` around a
-            `Simulation`, or an ``EnvBase`` with the same keys, attributes and methods. Without one,
-            the scene serves demonstrations, encoders, banks and trained policies.
+        make_env: Constructor of the environment, which gets the tasks, the `sizes` and what
+            `simulate` is given; a ``spread`` only with ``has_spread``. It is `SimulationEnv` around
+            a `Simulation`, or an ``EnvBase`` with the same keys, attributes and methods. Without
+            one, the scene serves demonstrations, encoders, banks and trained policies.
         frame_shape: Height and width of a frame, at least 16 each.
         action_size: Number of components of an action, each in [-1, 1].
         max_steps: Length of the longest episode.
@@ -259,7 +246,8 @@ class Scene:
         joints: Mean and spread of each joint's reading, by which policies that read joints beside
             frames scale them (`BGPOConfig.joints`); part of what ``version`` stands for. None if
             `Simulation.joints` is not defined.
-        weights: Encoders that come with it.
+        weights: Files of encoders that come with it, each with a bank beside it (`bank_path`), and
+            the tasks of each.
         modules: Modules that define tasks which are not the scene's own, by name of the task.
     """
 
@@ -280,7 +268,7 @@ class Scene:
     demonstrator: Callable[[Simulation, str, int], Callable[[], NDArray[Any]]] | None = None
     state: StateColumns | None = None
     joints: StateColumns | None = None
-    weights: Weights | None = None
+    weights: Mapping[Path, Sequence[str]] = field(default_factory=dict)
     modules: Callable[[Sequence[str]], Mapping[str, str]] = lambda _: {}
 
     def __post_init__(self) -> None:
@@ -343,6 +331,13 @@ class Scene:
         """Names of the tasks that come with the scene."""
         return self.default_tasks if self.own_tasks is None else self.own_tasks
 
+    @property
+    def sizes(self) -> dict[str, Any]:
+        """Sizes of frames, actions, ground truth and joints, as arguments of `SimulationEnv`."""
+        columns = {"state_size": self.state, "joint_size": self.joints}
+        known = {name: found.size for name, found in columns.items() if found is not None}
+        return {"frame_shape": self.frame_shape, "action_size": self.action_size, **known}
+
     def simulate(
         self,
         tasks: Sequence[str],
@@ -362,27 +357,17 @@ class Scene:
             observation: ``"pixels"``, ``"state"`` or ``"both"``.
 
         Raises:
-            ValueError: If a task is unknown, ground truth or spread are asked of a scene that has
-                none, or the environment does not observe the scene's joints.
+            ValueError: If a task is unknown, or ground truth or spread are asked of a scene that
+                has none.
         """
         self.check_tasks(tasks)
         self.check_spread(spread)
-        if observation != "pixels" and self.state is None:
-            raise ValueError(f"the scene {self.name!r} has no ground truth: observe pixels")
         if self.make_env is None:
             raise ValueError(f"the scene {self.name!r} has no simulation: give it a make_env")
-        options: dict[str, Any] = {"spread": spread} if self.has_spread else {}
-        env = self.make_env(
+        options = {**self.sizes, **({"spread": spread} if self.has_spread else {})}
+        return self.make_env(
             tasks, batch_size=batch_size, seed=seed, observation=observation, **options
         )
-        if self.joints is not None:
-            spec = env.observation_spec.get("joints", None)
-            if spec is None or spec.shape[-1] != self.joints.size:
-                raise ValueError(
-                    f"the scene {self.name!r} has {self.joints.size} joints, which its environment "
-                    f"does not observe: make it with joint_size={self.joints.size}"
-                )
-        return env
 
     def check_tasks(self, tasks: Sequence[str]) -> None:
         """Raise ``ValueError`` if a task does not exist or is named twice."""

@@ -50,13 +50,12 @@ def demonstrate(simulation, task, seed):
 
 def scene(make=Dot, **changes):
     """Return the dot as a scene."""
-    shape = {"frame_shape": (16, 24), "action_size": 1}
     return Scene(
         name="dot",
         version="dot-1",
         tasks=("left", "right"),
         default_tasks=("left", "right"),
-        make_env=partial(SimulationEnv, make, **shape),
+        make_env=partial(SimulationEnv, make),
         max_steps=12,
-        **{"demonstrator": demonstrate, **shape, **changes},
+        **{"demonstrator": demonstrate, "frame_shape": (16, 24), "action_size": 1, **changes},
     )

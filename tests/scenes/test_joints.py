@@ -18,7 +18,7 @@ from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.train import train_encoders
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.policy import load_run
-from bgpo_trl.scenes import SCENES, SimulationEnv, StateColumns
+from bgpo_trl.scenes import SCENES, StateColumns
 from bgpo_trl.training import Trainer
 from tests.helpers import TINY_ENCODERS
 from tests.scenes.dot import SavedDot, scene
@@ -34,11 +34,9 @@ class Jointed(SavedDot):
         return np.array([self.place, 10.0 + 2.0 * self.place])
 
 
-def jointed(make=Jointed, joint_size=2):
+def jointed(make=Jointed):
     """Return the dot as a scene with joints."""
-    shape = {"frame_shape": (16, 24), "action_size": 1}
-    make_env = partial(SimulationEnv, make, joint_size=joint_size, **shape)
-    return replace(scene(), make_env=make_env, joints=StateColumns(center=CENTER, scale=SCALE))
+    return scene(make, joints=StateColumns(center=CENTER, scale=SCALE))
 
 
 @pytest.fixture(scope="module")
@@ -198,8 +196,6 @@ def test_what_lacks_joints_is_refused_in_a_line(made, monkeypatch, tmp_path, ref
     other = torch.zeros(len(bank.steps.latent), 3)
     parts = (dataset, encoders, replace(bank, steps=replace(bank.steps, joints=other)))
     refused(lambda: trainer_of(parts, run), "has 3 joints", "make the bank again")
-    monkeypatch.setitem(SCENES, "dot", jointed(joint_size=None))
-    refused(lambda: trainer_of(made, run), "does not observe", "joint_size=2")
     monkeypatch.setitem(SCENES, "dot", scene(SavedDot))
     refused(lambda: trainer_of(made, run), "has no joints for policies", "set joints to False")
     frames = np.zeros((3, 16, 24, 3), np.uint8)

@@ -36,7 +36,7 @@ class Limited(SavedDot):
 
 
 def robot_scene(make=Limited, **changes):
-    return replace(scene(make, **changes), make_env=partial(RobotEnv, make, **SHAPE))
+    return replace(scene(make, **changes), make_env=partial(RobotEnv, make))
 
 
 def stepped(env, action):

@@ -1,7 +1,6 @@
 """Another robot than NICO, from its simulation to a policy that is loaded and filmed."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -266,8 +265,7 @@ def test_frames_actions_and_episodes_have_any_size(make, n_actions, n_steps, tmp
         ]
         for task in TASKS
     }
-    walker = scene(**shape)
-    walker = replace(walker, make_env=partial(SimulationEnv, make, **shape), max_steps=n_steps)
+    walker = replace(scene(make, **shape), max_steps=n_steps)
     monkeypatch.setitem(SCENES, "dot", walker)
     dataset = write_demonstrations(tmp_path / "own", shown, scene=walker, held_out_per_task=1)
     paths = tmp_path / "encoders.safetensors", tmp_path / "log"
@@ -312,9 +310,7 @@ class Seen(Dot):
 
 
 def seen(make=Seen):
-    shape = {"frame_shape": (16, 24), "action_size": 1, "state_size": 1}
-    columns = StateColumns(center=(0.0,), scale=(1.0,))
-    return replace(scene(make, state=columns), make_env=partial(SimulationEnv, make, **shape))
+    return scene(make, state=StateColumns(center=(0.0,), scale=(1.0,)))
 
 
 def recorded(path, robot, **options):
