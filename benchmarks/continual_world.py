@@ -26,11 +26,11 @@ from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.train import train_encoders
 from bgpo_trl.experiments.arguments import Arguments, ReportArguments
+from bgpo_trl.experiments.command_line import import_plugin
 from bgpo_trl.experiments.report import report
 from bgpo_trl.experiments.run import run_experiment
 from bgpo_trl.experiments.settings import run_config
 from bgpo_trl.machine import set_threads
-from bgpo_trl.plugins import import_plugin
 from bgpo_trl.scenes import find_scene
 
 MODULE, SCENE = "examples.continual_world", "cw10"

@@ -9,7 +9,6 @@ import importlib
 import inspect
 import sys
 
-from bgpo_trl.doctor import DoctorArguments
 from bgpo_trl.experiments import arguments
 from bgpo_trl.experiments.command_line import command_line
 
@@ -24,7 +23,7 @@ COMMANDS: dict[str, dict[str, tuple[str, type]]] = {
         "continual": ("experiments.paper", arguments.Arguments),
         "concurrent": ("experiments.paper", arguments.Arguments),
         "sweep": ("experiments.sweep", arguments.SweepArguments),
-        "doctor": ("doctor", DoctorArguments),
+        "doctor": ("experiments.doctor", arguments.DoctorArguments),
     },
     "look": {
         "report": ("experiments.report", arguments.ReportArguments),

@@ -15,10 +15,10 @@ from bgpo_trl.configs import RepresentationConfig, VAEConfig
 from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.experiments.arguments import Arguments
+from bgpo_trl.experiments.command_line import import_plugin
 from bgpo_trl.experiments.run import run_experiment
 from bgpo_trl.experiments.settings import run_config
 from bgpo_trl.machine import set_threads
-from bgpo_trl.plugins import import_plugin
 
 ENCODERS = RepresentationConfig(
     vae=VAEConfig(steps=2_000, bfloat16=True),

@@ -89,7 +89,7 @@ def test_experiments_keep_the_command_that_repeats_them(tmp_path, monkeypatch, n
     assert ran == [(["-m", "bgpo_trl", name, "--preset", "smoke"], name, tasks)]
 
 
-def test_what_a_command_returns_is_printed(monkeypatch, capsys):
+def test_a_command_imports_the_named_module_first_and_its_result_is_printed(monkeypatch, capsys):
     asked = []
 
     def watch(arguments: WatchArguments) -> str:
@@ -97,6 +97,7 @@ def test_what_a_command_returns_is_printed(monkeypatch, capsys):
         return "pictures"
 
     monkeypatch.setattr("bgpo_trl.experiments.watch.watch", watch)
+    monkeypatch.setattr("bgpo_trl.experiments.command_line.import_plugin", asked.append)
     call(monkeypatch, "watch", "runs/own", "--import", "my_tasks")
-    assert asked == [WatchArguments(run=Path("runs/own"), module="my_tasks")]
+    assert asked == ["my_tasks", WatchArguments(run=Path("runs/own"), module="my_tasks")]
     assert capsys.readouterr().out == "pictures\n"

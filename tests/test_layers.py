@@ -22,9 +22,9 @@ LAYERS = (
     "experiments",
 )
 """In the order of docs/design.md; ``top`` is the package itself."""
-TOP = ("world", "evaluation", "training", "policy", "doctor")
+TOP = ("world", "evaluation", "training", "policy")
 """Modules and packages of ``top``, in their order."""
-OPEN = ("configs", "errors", "seeding", "machine", "plugins")
+OPEN = ("configs", "errors", "seeding", "machine")
 """Open to all; they import from none of the layers."""
 LAST = ("__init__", "__main__")
 """The package's face and its command line, which import from anywhere."""

@@ -23,7 +23,6 @@ from timing import Timing, interleave, ratio
 from bgpo_trl.experiments.arguments import ImportArguments
 from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.machine import set_threads
-from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import TrainedPolicy, load_run
 
 Act = Callable[[np.ndarray], np.ndarray]
@@ -77,7 +76,6 @@ def measure(
 
 def main(arguments: Arguments) -> None:
     """Print the table."""
-    import_plugin(arguments.module)
     set_threads(1)
     policy = load_run(arguments.run)
     shape = (arguments.frames, *policy.encoders.frame_network.frame_shape, 3)

@@ -34,7 +34,6 @@ from bgpo_trl.evaluation import evaluator_of, snapshots_of, start_seeds
 from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.files.writing import check_folder
 from bgpo_trl.machine import set_threads
-from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import LoadedRun
 from bgpo_trl.runs.provenance import commit_of_code
 from bgpo_trl.scenes.nico import NicoSimulation
@@ -371,7 +370,6 @@ def aftermath(arguments: AftermathArguments) -> str:
         OSError: If the results cannot be written.
     """
     commit = commit_of_code()
-    import_plugin(arguments.module)
     set_threads(arguments.threads)
     out = arguments.out or arguments.run or Path("runs/aftermath")
     check_folder(out)

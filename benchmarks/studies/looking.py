@@ -38,7 +38,6 @@ from bgpo_trl.figures.style import COLORS, readable, save_figure
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.writing import check_folder
 from bgpo_trl.machine import set_threads
-from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import LoadedRun
 from bgpo_trl.runs.provenance import commit_of_code
 from bgpo_trl.scenes.nico import NICO, NicoEnv, NicoSimulation
@@ -283,7 +282,6 @@ def looking(arguments: TrainedArguments) -> str:
         OSError: If the results cannot be written.
     """
     commit, out = commit_of_code(), arguments.out or arguments.run
-    import_plugin(arguments.module)
     set_threads(arguments.threads)
     opengl.check()  # before the progress bar
     runs, rows = load_blocks_of_nico(arguments.run), list[Row]()

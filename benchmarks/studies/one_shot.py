@@ -26,7 +26,6 @@ from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.figures.style import COLORS, add_legend, readable, save_figure, style_axes
 from bgpo_trl.files.writing import check_folder
 from bgpo_trl.machine import set_threads
-from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import TrainedPolicy, load_run
 from bgpo_trl.runs.provenance import commit_of_code
 from bgpo_trl.seeding import stream_seed
@@ -188,7 +187,6 @@ def one_shot(arguments: OneShotArguments) -> str:
         OSError: If the results cannot be written.
     """
     commit, out = commit_of_code(), arguments.out or arguments.run
-    import_plugin(arguments.module)
     set_threads(arguments.threads)
     policy = load_run(arguments.run)
     check_folder(out)

@@ -25,7 +25,6 @@ from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.writing import check_folder
 from bgpo_trl.machine import set_threads
-from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import LoadedRun
 from bgpo_trl.runs.provenance import commit_of_code
 
@@ -123,7 +122,6 @@ def trained(arguments: TrainedArguments) -> str:
         OSError: If the results cannot be written.
     """
     commit, out = commit_of_code(), arguments.out or arguments.run
-    import_plugin(arguments.module)
     set_threads(arguments.threads)
     runs, rows = load_blocks(arguments.run), list[Row]()
     check_folder(out)

@@ -240,6 +240,19 @@ class SweepArguments(BankArguments):
 
 
 @dataclass(frozen=True)
+class DoctorArguments(ImportArguments):
+    """Check this machine and installation, a line for each check.
+
+    A line begins with ok, or with wrong for unusable, with which the exit status is 1.
+    """
+
+    frame: Path | None = None
+    """PNG file to write what the robot sees to."""
+    scene: str = "nico"
+    """Robot to check beside the machine, nico or one that the module of --import adds."""
+
+
+@dataclass(frozen=True)
 class ReportArguments:
     """Write tables and figures of runs: those in a folder, or single ones, of any algorithms.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import inspect
 import os
 import signal
@@ -32,6 +33,8 @@ def command_line(
 ) -> None:
     """Call a function with the arguments of the command line, and print what it returns.
 
+    The module that ``--import`` names is imported first.
+
     An expected error becomes one line. Ctrl-C and SIGTERM exit with 75 (``os.EX_TEMPFAIL``) if
     ``--resume`` can continue. An error of somebody else's code, such as a module named with
     ``--import``, keeps its traceback.
@@ -47,7 +50,9 @@ def command_line(
     resumable = hasattr(asked, "resume")
     try:
         with _terminable() if resumable else contextlib.nullcontext():
-            text = command(_parse(asked, options, program, line))
+            arguments = _parse(asked, options, program, line)
+            import_plugin(getattr(arguments, "module", None))
+            text = command(arguments)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         if _is_of_others(error):
             raise
@@ -59,6 +64,41 @@ def command_line(
         sys.exit(os.EX_TEMPFAIL)
     if text is not None:
         sys.stdout.write(f"{text}\n")
+
+
+def import_plugin(module: str | None) -> None:
+    """Import the user's module, from the current folder or installed.
+
+    It may add tasks with `suites.nico.add_task`, and entries to `bgpo_trl.scenes.SCENES`,
+    `bgpo_trl.algorithms.ALGORITHMS` and `bgpo_trl.modules.frame_network.FRAME_NETWORKS`.
+
+    Args:
+        module: Name of the module; nothing is imported if None.
+
+    Raises:
+        ValueError: If there is no such module, or another one has its name.
+    """
+    if module is None:
+        return
+    folder = str(Path.cwd())
+    missing = ValueError(
+        f"--import {module}: there is no such module in {folder} or installed; give the name "
+        "without .py, such as my_tasks"
+    )
+    names = module.split(".")
+    if not all(name.isidentifier() for name in names):
+        raise missing
+    if folder not in sys.path:  # `python script.py` has the script's folder there instead
+        sys.path.append(folder)
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise  # The module exists, and imports one that does not.
+        raise missing from None
+    here, there = Path(folder, *names).with_suffix(".py"), found.__file__
+    if here.exists() and there is not None and not here.samefile(there):
+        raise ValueError(f"--import {module}: {there} has the same name: rename {here}")
 
 
 @contextlib.contextmanager

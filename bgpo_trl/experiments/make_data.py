@@ -20,21 +20,18 @@ from bgpo_trl.experiments.arguments import (
     RecordArguments,
 )
 from bgpo_trl.machine import choose_device
-from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.provenance import command
 from bgpo_trl.scenes import Scene, find_scene
 
 
 def record(arguments: RecordArguments) -> None:
     """Record demonstrations, or random play; see `record_demonstrations`."""
-    import_plugin(arguments.module)
     options = {name: value for name, value in vars(arguments).items() if name != "module"}
     record_demonstrations(**options)
 
 
 def encoders(arguments: EncodersArguments) -> None:
     """Train both encoders on recordings, and embed these; see `train_encoders`."""
-    import_plugin(arguments.module)
     dataset, meta = load_demonstrations(arguments.dataset), read_meta(arguments.dataset)
     scene, weights, keep = find_scene(meta["scene"]), arguments.weights, arguments.keep
     train_encoders(
@@ -62,7 +59,6 @@ def _play(path: Path, scene: Scene) -> TensorDict:
 
 def bank(arguments: MakeBankArguments) -> None:
     """Embed a recorded dataset with trained encoders; see `make_bank`."""
-    import_plugin(arguments.module)
     meta, weights = read_meta(arguments.dataset), arguments.weights
     scene = find_scene(meta["scene"])
     weights = default_weights(scene=scene) if weights is None else weights
@@ -78,7 +74,6 @@ def bank(arguments: MakeBankArguments) -> None:
 
 def probes(arguments: ProbesArguments) -> None:
     """Evaluate trained encoders with probes; see `probe`."""
-    import_plugin(arguments.module)
     meta, weights = read_meta(arguments.dataset), arguments.weights
     scene = find_scene(meta["scene"])
     weights = default_weights(meta["tasks"], scene=scene) if weights is None else weights

@@ -5,14 +5,12 @@ from __future__ import annotations
 from bgpo_trl.data.film import read_film
 from bgpo_trl.experiments.arguments import OneShotArguments
 from bgpo_trl.experiments.watch import play
-from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import Recognition, load_run
 from bgpo_trl.scenes import find_scene
 
 
 def one_shot(arguments: OneShotArguments) -> str:
     """Show a policy a demonstration; return what it recognizes and, if asked for, achieves."""
-    import_plugin(arguments.module)
     policy = load_run(arguments.run, seed=arguments.run_seed)
     film = read_film(arguments.demonstration)
     frames = policy.preprocess(film, color="rgb", crop=arguments.crop)

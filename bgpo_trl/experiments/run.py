@@ -28,7 +28,6 @@ from bgpo_trl.experiments.settings import (
 )
 from bgpo_trl.files.writing import lock_directory, write_json
 from bgpo_trl.machine import choose_device, keep_freed_memory, set_threads
-from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.config_file import Digests, read_config
 from bgpo_trl.runs.dashboard import tensorboard_logger, wandb_logger
 from bgpo_trl.runs.demonstrations import load_inputs, own_weights
@@ -226,7 +225,6 @@ def pretrained_for(
 
 def bank_of(arguments: BankArguments) -> DemonstrationBank:
     """Load the demonstrations that a command line names, embedded by trained encoders."""
-    import_plugin(arguments.module)
     scene = chosen_scene(arguments.scene)
     tasks = chosen_tasks(arguments.tasks, scene)
     return pretrained_for(tasks, arguments.bank, scene=scene, weights=arguments.encoders)[1]

@@ -13,7 +13,6 @@ from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import PRESETS, RunConfig
 from bgpo_trl.configs.runs import check_seeds
 from bgpo_trl.experiments.arguments import SETTINGS, Arguments
-from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.config_file import read_config, read_settings
 from bgpo_trl.runs.directory import differing_settings
 from bgpo_trl.scenes import Scene, find_scene
@@ -26,12 +25,9 @@ def run_config(
 ) -> RunConfig:
     """Return the settings that a command line asks for.
 
-    Imports the module of own tasks and algorithms first.
-
     Raises:
         ValueError: If the settings are invalid, or a file, task or algorithm does not exist.
     """
-    import_plugin(arguments.module)
     config = _with_algorithm(_begin(arguments), arguments)
     scene = chosen_scene(arguments.scene, config.scene)
     if scene.name != config.scene:

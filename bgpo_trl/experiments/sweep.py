@@ -26,11 +26,11 @@ from typing import Any
 from bgpo_trl.algorithms import ABLATIONS
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.experiments.arguments import Arguments, Setting, SweepArguments
+from bgpo_trl.experiments.command_line import import_plugin
 from bgpo_trl.experiments.run import run_experiment
 from bgpo_trl.experiments.settings import run_config
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.writing import lock_directory
-from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.directory import holds_run
 from bgpo_trl.scenes import find_scene
@@ -248,7 +248,6 @@ def play_jobs(
 
 def sweep(arguments: SweepArguments) -> str:
     """Run the jobs of a grid that are not finished."""
-    import_plugin(arguments.module)
     jobs = make_jobs(arguments)
     todo = [job for job in jobs if not job.finished]
     failed: dict[Job, str] = {}

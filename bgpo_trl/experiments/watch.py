@@ -15,7 +15,6 @@ from bgpo_trl.experiments.arguments import WatchArguments
 from bgpo_trl.figures.frames import plot_frame_strips, save_gif
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.writing import check_folder
-from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import TrainedPolicy, load_run
 from bgpo_trl.scenes import Scene, Simulation, find_scene
 from bgpo_trl.scenes.scene import checked_frame, checked_numbers, checked_step
@@ -153,7 +152,6 @@ def _panel(frame: NDArray, caption: str, color: str) -> NDArray:
 def watch(arguments: WatchArguments) -> str:
     """Make the film that `WatchArguments` describes; return how the episodes ended."""
     run, out = arguments.run, arguments.out or arguments.run / "figures"
-    import_plugin(arguments.module)
     policy = load_run(run, seed=arguments.run_seed)
     check_folder(out)
     config, seed = policy.config, arguments.scene_seed

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bgpo_trl.plugins import import_plugin
+from bgpo_trl.experiments.command_line import import_plugin
 from examples.meta_world_frames import TwoCameras, place_cameras, simplified
 
 BALL = """

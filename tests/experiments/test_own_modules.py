@@ -10,6 +10,7 @@ from one_shot import OneShotArguments, one_shot
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.experiments.arguments import Arguments
+from bgpo_trl.experiments.command_line import import_plugin
 from bgpo_trl.experiments.paper import continual
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.experiments.watch import WatchArguments, watch
@@ -87,7 +88,8 @@ def test_a_task_and_an_algorithm_of_a_module_are_trained_reported_filmed_and_tes
     asked = Arguments(algorithm="mine", tasks=("at_once",), episodes=4)
     with pytest.raises(ValueError, match="'mine'"):
         continual(asked)
-    continual(replace(asked, module="mine_at_once"))
+    import_plugin("mine_at_once")
+    continual(asked)
     run = folder / "runs" / "continual-mine-quick"
     assert set(read_table(run / "eval.csv")["algorithm"]) == {"mine"}
     stored = json.loads((run / "config.json").read_text())["algorithm"]
@@ -97,10 +99,11 @@ def test_a_task_and_an_algorithm_of_a_module_are_trained_reported_filmed_and_tes
     assert "| at_once |" in report(ReportArguments((run,)))  # needs no module
     with pytest.raises(ValueError, match="name the module that adds it with --import"):
         watch(WatchArguments(run))
-    learned, *outcomes = watch(WatchArguments(run, module="mine_at_once")).splitlines()
+    import_plugin("mine_at_once")
+    learned, *outcomes = watch(WatchArguments(run)).splitlines()
     assert learned == "seed 3 after 4 training episodes"
     assert outcomes == ["at_once: success after 1 steps", f"pictures: {run / 'figures'}"]
 
-    one_shot(OneShotArguments(run=run, shares=(1.0,), episodes=2, module="mine_at_once"))
+    one_shot(OneShotArguments(run=run, shares=(1.0,), episodes=2))
     table = read_table(run / "one_shot.csv")[["seed", "task", "success"]]
     assert table.to_numpy().tolist() == [[3, "at_once", 1.0], [8, "at_once", 1.0]]

@@ -14,12 +14,12 @@ import pytest
 from packaging.requirements import Requirement
 from PIL import Image
 
-from bgpo_trl import doctor
-from bgpo_trl.doctor import DoctorArguments
+from bgpo_trl.experiments import doctor
+from bgpo_trl.experiments.arguments import DoctorArguments
 from bgpo_trl.scenes import SCENES
 from tests.scenes.dot import Dot, scene
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize(

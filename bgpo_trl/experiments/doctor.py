@@ -8,31 +8,14 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
-import tyro
+from bgpo_trl.experiments.arguments import DoctorArguments
 
 # Checkpoints of `--preset quick` take 0.2 GB; of 10 seeds and 20,000 episodes 9 GB.
 _ROOM = 0.5e9
 # Below, a run of --preset quick takes an hour for its frames alone.
 _SLOW = 30
-
-
-@dataclass(frozen=True)
-class DoctorArguments:
-    """Check this machine and installation, a line for each check.
-
-    A line begins with ok, or with wrong for unusable, with which the exit status is 1.
-    """
-
-    frame: Path | None = None
-    """PNG file to write what the robot sees to."""
-    scene: str = "nico"
-    """Robot to check beside the machine, nico or one that the module of --import adds."""
-    module: Annotated[str | None, tyro.conf.arg(name="import")] = None
-    """Module that adds the robot; here or installed."""
 
 
 def doctor(arguments: DoctorArguments) -> None:
@@ -80,10 +63,8 @@ def check_scene(arguments: DoctorArguments) -> str:
     import torch
     from PIL import Image
 
-    from bgpo_trl.plugins import import_plugin
     from bgpo_trl.scenes import find_scene
 
-    import_plugin(arguments.module)
     scene = find_scene(arguments.scene)
     env = scene.simulate(scene.default_tasks, batch_size=[10], seed=0)
     torch.manual_seed(0)

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from bgpo_trl.plugins import import_plugin
+from bgpo_trl.experiments.command_line import import_plugin
 from suites import nico
 
 OWN = """
