@@ -1,8 +1,8 @@
-"""Wrong values in Python: each is refused in one line that says what to do.
+"""Wrong values and files in Python: each is refused in one line that says what to do.
 
-A case is a call and what its message says of the cause. Settings are in `test_configs.py`, files in
-`test_bad_files.py`, command lines in `benchmarks/test_bad_command_lines.py`. Values of a wrong
-Python type are not here: the types are annotated, and their errors are Python's own.
+A case is a call and what its message says of the cause, for files also of the remedy. Settings are
+in `test_configs.py`, command lines in `experiments/test_command_line.py`. Values of a wrong Python
+type are not here: the types are annotated, and their errors are Python's own.
 """
 
 import math
@@ -14,10 +14,11 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import Compose, StepCounter, TransformedEnv
 
-from bgpo_trl.analysis import statistics
-from bgpo_trl.configs import RunConfig
-from bgpo_trl.files.checkpoint import load_checkpoint
-from bgpo_trl.machine import choose_device, set_threads
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders.pretrained import bank_path, default_weights, load_pretrained
+from bgpo_trl.encoders.representation import load_representation
+from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
+from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor
@@ -29,6 +30,7 @@ from bgpo_trl.objectives.supervised import (
     sequence_reconstruction_loss,
     vae_inverse_loss,
 )
+from bgpo_trl.runs.results import read_json, read_run
 from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.training import Trainer
 from bgpo_trl.transforms import (
@@ -137,32 +139,19 @@ WRONG = {
     "sequences without lengths": (
         lambda: sequence_reconstruction_loss(lae, TensorDict({"latent": z}, [2])), "no 'length'"),
     # the world
-    "a run of no seed": (lambda: RunConfig(seeds=()), "seeds must be one or more"),
-    "a run of a seed twice": (lambda: RunConfig(seeds=(1, 1)), "all different"),
-    "a run of a negative seed": (lambda: RunConfig(seeds=(-1,)), "none negative"),
+    "no simulation": (lambda: NicoEnv(batch_size=[0]), "got 0"),
     "unknown task": (lambda: NicoEnv(["juggle"], observation="state"), "'juggle'"),
     "no task": (lambda: NicoEnv([]), "got []"),
     "a name for a list": (lambda: NicoEnv("grasp_glass"), "'grasp_glass'"),
     "a task twice": (lambda: NicoEnv(["grasp_glass"] * 2), "'grasp_glass'"),
-    "no simulation": (lambda: NicoEnv(batch_size=[0]), "got 0"),
     "no row": (lambda: source(batch_size=0), "got 0"),
     "no thread": (lambda: NicoEnv(threads=0), "got 0"),
-    "too few seeds": (lambda: NicoEnv(batch_size=[2], seed=[1]), "1 seeds for 2"),
-    "seed below 0": (lambda: NicoEnv(seed=-1), "got -1"),
-    "seed too large": (lambda: NicoEnv(batch_size=2, seed=[0, 2**32]), "4294967296"),
-    "negative seed": (lambda: nico.load("grasp_glass", seed=-1), "Seed"),
     "frames that are not drawn": (lambda: NicoEnv(observation="state").frames(), "no frames"),
     "action of another robot": (lambda: step_with(torch.zeros(7)), "got [7]"),
     "no action": (lambda: step_with(None), "NicoEnv found no 'action'"),
-    "misspelt task": (lambda: nico.load("grasp_glas"), "'grasp_glas'"),
-    "a task called all": (lambda: nico.add_task("all", nico.NicoTask), "called 'all'"),
     "no time": (lambda: nico.load("grasp_glass", time_limit=NAN), "got nan"),
     "demonstrator of a stranger": (
         lambda: Demonstrator(SimpleNamespace(task=None, physics=None)), "NoneType"),
-    "demonstrator in mid-air": (
-        lambda: Demonstrator(nico.load("grasp_glass", observation="state"))(None), "reset()"),
-    "no GPU": (lambda: choose_device("cuda:99"), "no device 'cuda:99'"),
-    "no threads": (lambda: set_threads(0), "threads"),
     # transforms
     "schedule of nothing": (lambda: TaskSchedule(()), "()"),
     "schedule without a start": (lambda: TaskSchedule((5, 9)), "(5, 9)"),
@@ -190,8 +179,6 @@ WRONG = {
         ).reset(), "have sizes (16, 32)"),
     "NaN bonus": (lambda: BehaviorMatchingReward(lae, beta=NAN), "got nan"),
     "time limit too late": (lambda: world(source(), StepCounter(5)).reset(), "DemonstrationSource"),
-    # measures
-    "difference of NaN": (lambda: statistics.difference([1.0], [NAN]), "must be finite"),
 }  # fmt: skip
 
 
@@ -201,6 +188,29 @@ def test_a_wrong_value_is_refused_in_one_line(call, cause):
         call()
     assert str(raised.value).isprintable()
     assert cause in str(raised.value)
+
+
+FILES = {
+    "csv that is a folder": (lambda f: CsvFile(f, ["a"]), "Is a directory", "choose another run"),
+    "checkpoint in a file": (
+        lambda f: save_checkpoint(f / "file", {"a": 1}), "cannot save a checkpoint", "make room"),
+    "no run": (lambda f: read_run(f / "nowhere"), "there is no run at", "name another"),
+    "no settings": (lambda f: read_json(f / "config.json"), "is missing", "let the run in"),
+    "no encoders": (
+        lambda f: load_pretrained(f / "a.safetensors"), "no encoder weights", "--train-encoders"),
+    "a bank for encoders": (
+        lambda f: load_representation(bank_path(default_weights())), "damaged or holds no",
+        "--train-encoders"),
+    "recording of no task": (
+        lambda f: record_demonstrations(f / "d", tasks=[], per_task=2, held_out_per_task=1),
+        "tasks", "name at least one"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "cause", "remedy"), FILES.values(), ids=FILES.keys())
+def test_a_bad_file_is_refused_and_nothing_changes(tmp_path, refused, call, cause, remedy):
+    (tmp_path / "file").write_text("x")
+    refused(lambda: call(tmp_path), cause, remedy)
 
 
 def test_a_policy_that_has_diverged_ends_the_run_in_one_line(make_config, bank, tmp_path, encoders):

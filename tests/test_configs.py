@@ -89,10 +89,17 @@ def test_a_bad_value_is_refused_with_the_name_of_its_field(refused, config, name
     refused(lambda: config(**{name: value}), f"{name} must be ", f"got {value}")
 
 
-@pytest.mark.parametrize("starts", [(), (0, -1, 300), (0, 0.5, 1), (0, 1)])
-def test_task_starts_are_whole_numbers_from_0_one_for_each_task(starts):
-    with pytest.raises(ValueError, match="task_starts must be "):
-        RunConfig(task_starts=starts)
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("task_starts", [(), (0, -1, 300), (0, 0.5, 1), (0, 1)]),
+        ("seeds", [(), (1, 1), (-1,)]),
+    ],
+)
+def test_starts_are_whole_numbers_from_0_one_for_each_task_and_seeds_differ(name, values):
+    for value in values:
+        with pytest.raises(ValueError, match=f"{name} must be "):
+            RunConfig(**{name: value})
 
 
 def test_numbers_and_sequences_of_other_libraries_become_plain():

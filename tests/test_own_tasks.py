@@ -60,14 +60,12 @@ def test_an_added_task_can_be_loaded_by_name():
     assert rate.tolist() == [0, 1]
 
 
-@pytest.mark.parametrize(
-    ("name", "task"),
-    [("grasp_glass", AtOnce), ("at/once", AtOnce), ("", AtOnce), ("juggle", object)],
-)
-def test_bad_names_and_classes_of_tasks_are_refused(name, task):
+def test_bad_names_and_classes_of_tasks_are_refused():
     before = dict(nico.TASKS)
-    with pytest.raises(ValueError, match=r"cannot be called|must be a subclass"):
-        nico.add_task(name, task)
+    names = ("grasp_glass", "at/once", "", "all")
+    for name, task in (*((name, AtOnce) for name in names), ("juggle", object)):
+        with pytest.raises(ValueError, match=r"cannot be called|must be a subclass"):
+            nico.add_task(name, task)
     assert dict(nico.TASKS) == before
 
 
@@ -117,17 +115,11 @@ def test_banks_are_joined_by_the_names_of_their_tasks():
     assert names_and_embeddings(joined) == [("a", 0, 0), ("b", 1, 1), ("c", 0, 0), ("b", 1, 1)]
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"tasks": ("juggle",), "task_starts": (0,)},
-        {"tasks": ("at_once",) * 2, "task_starts": (0, 2)},
-        {"tasks": ("at_once",), "task_starts": (0, 2)},
-        {"tasks": ("at_once",), "task_starts": (0,)},  # no demonstration of it
-    ],
-)
-def test_a_run_of_tasks_that_do_not_fit_is_refused_before_it_writes(make_config, tmp_path, changes):
-    with pytest.raises(ValueError, match=r"juggle|at_once|task_starts"):
-        config = make_config("state", "oracle", **changes)
+@pytest.mark.parametrize("task", ["juggle", "at_once"])
+def test_a_run_of_a_task_unknown_or_never_shown_is_refused_before_it_writes(
+    make_config, tmp_path, task
+):
+    config = make_config("state", "oracle", tasks=(task,), task_starts=(0,))
+    with pytest.raises(ValueError, match=f"'{task}'"):
         Trainer(config, tmp_path / "run", bank=bank_of(*nico.PAPER_TASKS), progress=False)
     assert list(tmp_path.iterdir()) == []

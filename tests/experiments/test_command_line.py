@@ -54,6 +54,7 @@ CASES = [
     ("concurrent_tasks.py --device cuda:99", "cuda:99"),
     ("bgpo continual --config new", "--config"),
     ("eight_tasks.py --eval-every 0", "eval_every"),
+    ("bgpo continual --eval-episodes 0", "set eval_episodes to at least 1"),
     ("studies/privileged_information.py --inputs smell", "--inputs"),
     ("speed/steps.py ppo", "no algorithm 'ppo'"),
     # tasks and their demonstrations
