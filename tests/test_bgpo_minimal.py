@@ -13,6 +13,7 @@ from bgpo_trl.configs import RunConfig
 from bgpo_trl.training import Trainer
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "bgpo_minimal.py"
+OF_RL = ("hidden_sizes", "batch_size", "replay_size", "warmup_steps")
 STORED = {  # entries of the example's replay, by their keys in the library
     "latent": "latent",
     "behavior": "behavior",
@@ -70,13 +71,7 @@ def library(small, encoders, bank, tmp_path_factory):
         max_steps=small.max_steps,
         state_limit=small.state_limit,
         gwr=replace(defaults.gwr, activity_scale=small.activity_scale),
-        rl=replace(
-            defaults.rl,
-            hidden_sizes=small.hidden_sizes,
-            batch_size=small.batch_size,
-            replay_size=small.replay_size,
-            warmup_steps=small.warmup_steps,
-        ),
+        rl=replace(defaults.rl, **{name: getattr(small, name) for name in OF_RL}),
     )
     run = RunConfig(
         seeds=(small.seed,),
@@ -119,9 +114,7 @@ def test_defaults_are_those_of_bgpo_single(example):
     settings, config = example.Settings(), entry("bgpo-single").config
     for name in ("max_steps", "beta", "behavior_scale", "state_limit"):
         assert getattr(settings, name) == getattr(config, name), name
-    for name in ("hidden_sizes", "learning_rate", "batch_size", "replay_size", "warmup_steps"):
-        assert getattr(settings, name) == getattr(config.rl, name), name
-    for name in ("noise", "gamma", "tau", "pre_tanh_penalty"):
+    for name in ("learning_rate", "noise", "gamma", "tau", "pre_tanh_penalty", *OF_RL):
         assert getattr(settings, name) == getattr(config.rl, name), name
     assert settings.activity_scale == config.gwr.activity_scale
 

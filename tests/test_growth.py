@@ -8,7 +8,7 @@ from functools import partial
 import pytest
 import torch
 
-from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
+from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.growth import add_task, distinctness
@@ -21,22 +21,14 @@ NEW = "lift_green"
 
 
 @pytest.fixture(scope="module")
-def further(encoders, tmp_path_factory):
-    """A file with demonstrations of a fourth task."""
-    generator = torch.Generator().manual_seed(2)
-    train = torch.arange(12) < 8
-    steps = DemonstrationSteps.of(
-        torch.randn(12, 6, 64, generator=generator),
-        torch.rand(12, 5, 4, generator=generator),
-        (3 + torch.arange(12) % 4) * train,
-    )
-    path = tmp_path_factory.mktemp("further") / "bank.safetensors"
-    added = DemonstrationBank(
-        torch.rand(12, 32, generator=generator) - 2.5,
-        torch.zeros(12, dtype=torch.int64),
-        train,
-        (NEW,),
-        steps=steps,
+def further(bank, encoders, tmp_path_factory):
+    """A file with demonstrations of a fourth task, which lie apart from the others."""
+    shown, path = bank.of_task(2), tmp_path_factory.mktemp("further") / "bank.safetensors"
+    added = replace(
+        shown,
+        embedding=shown.embedding - 4.0,
+        task=torch.zeros_like(shown.task),
+        tasks=(NEW,),
         encoder_id=encoders.identity,
         scene=encoders.metadata["scene"],
     )
@@ -111,29 +103,6 @@ def test_a_run_that_is_interrupted_after_the_addition_equals_one_that_is_not(gro
     with resumed(run, grown, bank=bank) as trainer:
         trainer.run()
     assert_same_run(run, straight)
-
-
-def test_a_seed_alone_equals_the_seed_in_the_batch_after_the_addition(
-    grow, begin, three, further, tmp_path
-):
-    run, grown = grow("batch")
-    with resumed(run, grown) as trainer:
-        trainer.run()
-    alone = replace(read_config(three / "config.json")[0], seeds=(8,))
-    with begin(tmp_path / "alone", alone) as trainer:
-        trainer.run()
-    mine = add_task(tmp_path / "alone", NEW, config=replace(alone, episodes=36), bank=further)
-    config = replace(mine.config, task_starts=grown.config.task_starts)
-    with resumed(tmp_path / "alone", mine._replace(config=config)) as trainer:
-        trainer.run()
-    discrete = ("episode", "task", "success", "steps", "num_nodes", "group", "num_groups")
-    for name in ("train.csv", "eval.csv"):
-        batch, mine = (
-            [[row.get(key) for key in discrete] for row in rows(path / name) if row["seed"] == "8"]
-            for path in (run, tmp_path / "alone")
-        )
-        assert batch == mine
-        assert any(NEW in row for row in mine)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
-"""Runs that are killed, run out of disk space or lose a checkpoint end as if uninterrupted."""
+"""Runs that are killed or run out of disk space end as if uninterrupted."""
 
 import multiprocessing
-import shutil
 import time
 from contextlib import ExitStack
 from functools import partial
@@ -11,10 +10,9 @@ import pytest
 import torch
 
 from bgpo_trl.data.dataset import load_demonstrations
-from bgpo_trl.encoders import fitting
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.files.checkpoint import load_checkpoint
-from tests.helpers import at_step, interrupt, largest_file
+from tests.helpers import at_step, largest_file
 from tests.resumable import play, train_small_encoders
 from tests.test_training import assert_same_run
 
@@ -136,34 +134,3 @@ def test_a_run_ended_by_a_full_disk_can_be_resumed(uninterrupted, make, tmp_path
     assert (tmp_path / "train.csv").read_bytes().endswith(b"\n")
     make(tmp_path, resume=True).run()
     assert_same_run(tmp_path, uninterrupted)
-
-
-def test_a_run_is_resumed_from_the_checkpoint_before_a_damaged_one(uninterrupted, make, tmp_path):
-    interrupt(make(tmp_path), 20)
-    _, newest = sorted((tmp_path / "checkpoint").iterdir())
-    newest.write_bytes(newest.read_bytes()[: newest.stat().st_size // 2])
-    with pytest.warns(UserWarning, match=f"{newest.name} is damaged"):
-        resumed = make(tmp_path, resume=True)
-    assert resumed.env_steps == 19
-    resumed.run()
-    assert_same_run(tmp_path, uninterrupted)
-
-
-def test_encoder_training_is_resumed_from_the_checkpoint_before_a_damaged_one(
-    learned, tmp_path, monkeypatch
-):
-    shutil.copytree(learned / "demonstrations", tmp_path / "demonstrations")
-    save, saved = fitting.save_checkpoint, []
-
-    def save_or_die(*arguments):
-        if len(saved) == 3:
-            raise KeyboardInterrupt
-        saved.append(save(*arguments))
-
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(fitting, "save_checkpoint", save_or_die)
-        train_small_encoders(tmp_path)
-    saved[-1].write_bytes(saved[-1].read_bytes()[:-1])
-    with pytest.warns(UserWarning, match=f"{saved[-1].name} is damaged"):
-        train_small_encoders(tmp_path)
-    assert_same_encoders(tmp_path, learned)

@@ -2,7 +2,7 @@
 
 import itertools
 import signal
-from collections import Counter, defaultdict
+from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -85,7 +85,9 @@ def test_every_seed_plays_every_episode_once(run_of, config_of, name):
             assert 0 <= int(row["group"]) < int(row["num_groups"])
     assert {row["success"] for row in train} == {"0", "1"}
     for file in CSV_FILES:
-        assert {row["algorithm"] for row in rows(run_of(name) / file)} == {name}
+        for row in rows(run_of(name) / file):
+            assert row["algorithm"] == name
+            assert int(row["episode"]) > config.task_starts[TASKS.index(row["task"])]
     if name.startswith("bgpo"):
         assert int(train[-1]["num_nodes"]) > 2
     assert (float(train[0]["loss_value"]), float(train[-1]["loss_value"]) > 0) == (0, True)
@@ -103,19 +105,6 @@ def test_all_presented_tasks_are_tested_every_few_episodes(begin, make_config, t
     for row in tests:
         assert row["env_steps"] == steps[row["seed"], row["episode"]]
         assert int(row["success"]) == float(row["return"])
-
-
-def test_tasks_are_presented_from_their_starts_on(begin, make_config, tmp_path):
-    starts = (4, 0, 8)
-    config = make_config("state", "oracle", seeds=(0, 1, 2), episodes=12, task_starts=starts)
-    begin(tmp_path, config).run()
-    first = defaultdict(lambda: 99)
-    for row in rows(tmp_path / "train.csv"):
-        first[row["task"]] = min(first[row["task"]], int(row["episode"]))
-    for task, start in zip(TASKS, starts, strict=True):
-        assert start < first[task] <= start + 3  # three seeds draw: the next episodes have it
-    for row in rows(tmp_path / "eval.csv"):
-        assert int(row["episode"]) > starts[TASKS.index(row["task"])]
 
 
 @pytest.mark.parametrize(("name", "seed"), zip(LEARNERS, itertools.cycle((3, 8)), strict=False))

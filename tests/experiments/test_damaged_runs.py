@@ -120,10 +120,7 @@ def test_final_tests_and_summary_are_optional_in_a_report(run):
 
 LOADED = {
     **damages("config.json"),
-    **{
-        f"a checkpoint that is {name}": partial(put_checkpoint, content=content)
-        for name, content in CHECKPOINTS.items()
-    },
+    "a checkpoint of something else": partial(put_checkpoint, content=CHECKPOINTS["a list"]),
     "edited settings": settings(eval_episodes=7),
     "no starts": settings(task_starts=[]),
 }

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import signal
 from dataclasses import asdict, replace
 from functools import partial
 
@@ -14,16 +13,9 @@ from bgpo_trl.runs.directory import RunLogger, check_settings
 from bgpo_trl.runs.results import COLUMNS
 from bgpo_trl.scenes import SCENES, find_scene
 from tests.algorithms.playing import assert_same
-from tests.helpers import CHECKPOINTS, UNPICKLED, edit, put_checkpoint, rows
-from tests.test_training import at_step
+from tests.helpers import CHECKPOINTS, UNPICKLED, edit, interrupt, put_checkpoint, rows
 
 pytestmark = pytest.mark.usefixtures("easy_world")
-
-
-def interrupt(trainer, step):
-    at_step(trainer, step, lambda: signal.raise_signal(signal.SIGINT))
-    with pytest.raises(KeyboardInterrupt):
-        trainer.run()
 
 
 @pytest.fixture(scope="module")

@@ -151,17 +151,6 @@ def succeed(env: NicoEnv, row: int, td: TensorDictBase) -> TensorDictBase:
     raise AssertionError("the demonstration failed")
 
 
-def test_success_terminates_only_its_row():
-    env = NicoEnv(batch_size=[2], seed=2, observation="state")
-    last = succeed(env, 1, env.reset(task_td(0, 0)))
-    assert last["reward"].tolist() == [[0.0], [1.0]]
-    assert last["terminated"].tolist() == last["done"].tolist() == [[False], [True]]
-    assert not last["truncated"].any()
-    env.reset(last.clone().set("_reset", torch.tensor([[True], [False]])))
-    after = env.step(last.exclude("reward").set("action", torch.zeros(2, 4)))["next"]
-    assert after["done"].tolist() == [[False], [True]]
-
-
 def loaded(env: NicoEnv) -> NicoEnv:
     """Return a new environment with the state of another."""
     fresh = NicoEnv(batch_size=env.batch_size, observation=env.observation)
@@ -170,16 +159,22 @@ def loaded(env: NicoEnv) -> NicoEnv:
 
 
 @pytest.mark.parametrize("continued", [lambda env: env, deepcopy, loaded])
-def test_a_done_row_stands_still_until_its_reset(continued):
+def test_success_terminates_only_its_row_which_stands_still_until_its_reset(continued):
     env = NicoEnv(batch_size=[2], seed=2, observation="both")
-    last = succeed(env, 1, env.reset(task_td(0, 0))).exclude("reward")
-    env = continued(env)
+    last = succeed(env, 1, env.reset(task_td(0, 0)))
+    assert last["reward"].tolist() == [[0.0], [1.0]]
+    assert last["terminated"].tolist() == last["done"].tolist() == [[False], [True]]
+    assert not last["truncated"].any()
+    last, env = last.exclude("reward"), continued(env)
     for mask in ({}, {"_step": torch.ones(2, dtype=torch.bool)}):
         after = env.step(last.clone().update({"action": torch.full((2, 4), 0.5), **mask}))["next"]
         assert after["reward"].tolist() == [[0.0], [0.0]]
         assert after["done"].tolist() == [[False], [True]]
         assert after["pixels"][1].equal(last["pixels"][1])
         assert not after["state"][0].equal(last["state"][0])
+    env.reset(last.clone().set("_reset", ~last["done"]))  # of the other row
+    after = env.step(last.clone().set("action", torch.zeros(2, 4)))["next"]
+    assert after["done"].tolist() == [[False], [True]]
     fresh = env.reset(TensorDict({"_reset": last["done"]}, [2]))
     assert not fresh["done"].any()
     assert not fresh["state"][1].equal(last["state"][1])

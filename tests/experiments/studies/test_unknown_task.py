@@ -53,10 +53,3 @@ def test_only_a_task_with_other_embeddings_is_detected():
     same = places((0.0, 0.0), (3.0, 0.0), (3.0, 0.0))
     found = leave_one_out(same, 2, seeds=[0], draws=100)
     assert 0.2 < found.area.item() < 0.8 and found.detected.item() == 0.0
-
-
-def test_a_seed_in_a_batch_equals_the_seed_alone():
-    bank = places((0.0, 0.0), (3.0, 0.0), (0.0, 3.0), spread=0.5)
-    both = leave_one_out(bank, 0, seeds=[3, 4], draws=50)
-    alone = leave_one_out(bank, 0, seeds=[4], draws=50)
-    torch.testing.assert_close(both.known[1:], alone.known)
