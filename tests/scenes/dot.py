@@ -1,11 +1,20 @@
 """The smallest robot: a dot that moves along a line, one action, frames of 16 x 24."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
+from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.configs import RunConfig
+from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.scenes import Outcome, Scene, Simulation, SimulationEnv
 from bgpo_trl.seeding import random_state, set_random_state
+from bgpo_trl.training import Trainer
+from tests.helpers import TINY_ENCODERS
+
+TASKS = ("left", "right")
+SHAPE = {"frame_shape": (16, 24), "action_size": 1}
 
 
 class Dot(Simulation):
@@ -48,14 +57,57 @@ def demonstrate(simulation, task, seed):
     return lambda: np.array([(0.3 if task == "right" else -0.3) + 0.05 * random.standard_normal()])
 
 
-def scene(make=Dot, **changes):
+def scene(make=Dot, *, env=SimulationEnv, **changes):
     """Return the dot as a scene."""
-    return Scene(
-        name="dot",
-        version="dot-1",
-        tasks=("left", "right"),
-        default_tasks=("left", "right"),
-        make_env=partial(SimulationEnv, make),
-        max_steps=12,
-        **{"demonstrator": demonstrate, "frame_shape": (16, 24), "action_size": 1, **changes},
+    options = {
+        "tasks": TASKS,
+        "default_tasks": TASKS,
+        "make_env": partial(env, make),
+        "max_steps": 12,
+        "demonstrator": demonstrate,
+    }
+    return Scene(name="dot", version="dot-1", **{**SHAPE, **options, **changes})
+
+
+def pretrain(robot, folder, per_task=6):
+    """Return encoders and bank of new demonstrations of a scene, two a task held out."""
+    return make_pretrained(
+        folder / "encoders.safetensors",
+        folder / "demonstrations",
+        folder=folder / "log",
+        scene=robot,
+        config=TINY_ENCODERS,
+        per_task=per_task,
+        held_out_per_task=2,
+        progress=False,
     )
+
+
+def run_config(name="bgpo", algorithm=None, **changes):
+    """Return the settings of a run of four episodes, with some of them and the algorithm's changed.
+
+    Args:
+        name: Of the algorithm.
+        algorithm: Changes of its settings, those of its networks and updates under ``rl``.
+        **changes: Changes of the run's settings.
+    """
+    usual, given = ALGORITHMS[name].config, {"max_steps": 12, **(algorithm or {})}
+    rl = replace(usual.rl, **{"warmup_steps": given["max_steps"], **given.pop("rl", {})})
+    config = RunConfig(
+        scene="dot",
+        tasks=TASKS,
+        task_starts=(0, 2),
+        seeds=(3, 5),
+        episodes=4,
+        eval_every=2,
+        name=name,
+        algorithm=replace(usual, rl=rl, **given),
+    )
+    return replace(config, **changes)
+
+
+def trainer_of(directory, pretrained, config=None, **options):
+    """Return the trainer of a run with these encoders and this bank."""
+    encoders, bank = pretrained
+    parts = {"bank": bank, "encoders": encoders, "progress": False, **options}
+    return Trainer(config or run_config(), directory, **parts)

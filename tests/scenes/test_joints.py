@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.configs import BGPOConfig, RunConfig
+from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
 from bgpo_trl.data.lerobot import read_lerobot, write_lerobot
@@ -19,11 +19,9 @@ from bgpo_trl.encoders.train import train_encoders
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.policy import load_run
 from bgpo_trl.scenes import SCENES, StateColumns
-from bgpo_trl.training import Trainer
 from tests.helpers import TINY_ENCODERS
-from tests.scenes.dot import SavedDot, scene
+from tests.scenes.dot import TASKS, SavedDot, run_config, scene, trainer_of
 
-TASKS = ("left", "right")
 CENTER, SCALE = (0.5, 10.0), (2.0, 4.0)
 
 
@@ -55,17 +53,16 @@ def dot(monkeypatch):
     monkeypatch.setitem(SCENES, "dot", jointed())
 
 
-def config_of(**changes):
-    algorithm = replace(ALGORITHMS["bgpo"].config, max_steps=12, joints=True)
-    rl = replace(algorithm.rl, warmup_steps=12, batch_size=8, hidden_sizes=(16,))
-    algorithm = replace(algorithm, rl=rl, expert_batch_size=8, demonstration_noise=0.0, **changes)
-    starts = {"tasks": TASKS, "task_starts": (0, 0), "seeds": (3, 5)}
-    return RunConfig(scene="dot", episodes=4, eval_every=2, algorithm=algorithm, **starts)
+SMALL = {"warmup_steps": 12, "batch_size": 8, "hidden_sizes": (16,)}
+JOINED = {"joints": True, "rl": SMALL, "expert_batch_size": 8, "demonstration_noise": 0.0}
 
 
-def trainer_of(made, folder, config=None):
-    parts = {"encoders": made[1], "bank": made[2], "progress": False}
-    return Trainer(config or config_of(), folder, **parts)
+def run(made, folder, name="bgpo", algorithm=JOINED):
+    """Return the trainer of a run, after it."""
+    config = run_config(name, algorithm, task_starts=(0, 0))
+    with trainer_of(folder, made[1:], config) as trainer:
+        trainer.run()
+    return trainer
 
 
 def scaled(readings):
@@ -113,13 +110,11 @@ def test_joints_of_others_come_by_arrays_and_lerobot(made, tmp_path):
 
 def test_replays_hold_joints_as_policies_read_them(made, dot, tmp_path):
     """A step moves the dot by half the action, and its joints by as much and twice as much."""
-    with trainer_of(made, tmp_path / "run") as trainer:
-        trainer.run()
-        algorithm = trainer.algorithm
-        played = algorithm.replay.contents(0)[0]
-        groups = torch.zeros(2, 32, dtype=torch.int64)
-        shown = algorithm.shown.draw(groups)
-        imitated = algorithm.shown.draw_actions(groups, 0.0)
+    algorithm = run(made, tmp_path / "run").algorithm
+    played = algorithm.replay.contents(0)[0]
+    groups = torch.zeros(2, 32, dtype=torch.int64)
+    shown = algorithm.shown.draw(groups)
+    imitated = algorithm.shown.draw_actions(groups, 0.0)
     assert algorithm.in_keys == ["latent_and_joints", "context"]
     recorded = scaled(made[2].steps.joints)
     for key in ("latent_and_joints", ("next", "latent_and_joints")):
@@ -131,15 +126,14 @@ def test_replays_hold_joints_as_policies_read_them(made, dot, tmp_path):
 
 
 def test_policies_and_critics_depend_on_joints(made, dot, tmp_path, refused):
-    with trainer_of(made, tmp_path / "run") as trainer:
-        trainer.run()
-        loss = trainer.algorithm.learner.loss
-        drawn = trainer.algorithm.shown.draw(torch.zeros(2, 1, 4, dtype=torch.int64))
-        batch = TensorDict(drawn, [2, 1, 4])
-        changed = batch.clone()
-        changed["latent_and_joints"][..., -1] += 1.0
-        values = [loss.values("value_network", data) for data in (batch, changed)]
-        assert (values[0] != values[1]).all()
+    algorithm = run(made, tmp_path / "run").algorithm
+    drawn = algorithm.shown.draw(torch.zeros(2, 1, 4, dtype=torch.int64))
+    batch = TensorDict(drawn, [2, 1, 4])
+    changed = batch.clone()
+    changed["latent_and_joints"][..., -1] += 1.0
+    loss = algorithm.learner.loss
+    values = [loss.values("value_network", data) for data in (batch, changed)]
+    assert (values[0] != values[1]).all()
     policy, frame = load_run(tmp_path / "run"), np.full((16, 24, 3), 90, np.uint8)
     policy.condition(np.stack([frame] * 4))
     action = policy.act(frame, [0.5, 11.0])
@@ -157,13 +151,8 @@ def test_policies_and_critics_depend_on_joints(made, dot, tmp_path, refused):
 
 @pytest.mark.parametrize("name", ["dist-nll", "maml", "ewc"])
 def test_baselines_read_joints_too(made, dot, tmp_path, name):
-    algorithm = replace(ALGORITHMS[name].config, max_steps=12, joints=True)
-    rl = replace(algorithm.rl, warmup_steps=12, batch_size=8, hidden_sizes=(16,))
     changes = {} if name == "ewc" else {"task_batch_size": 8}
-    algorithm = replace(algorithm, rl=rl, **changes)
-    config = replace(config_of(), name=name, algorithm=algorithm)
-    with trainer_of(made, tmp_path / "run", config) as trainer:
-        trainer.run()
+    run(made, tmp_path / "run", name, {"joints": True, "rl": SMALL, **changes})
     policy, frame = load_run(tmp_path / "run"), np.full((16, 24, 3), 90, np.uint8)
     differ = []  # Dist-NLL has no policy of a task that was hardly played.
     for task in TASKS:
@@ -174,11 +163,9 @@ def test_baselines_read_joints_too(made, dot, tmp_path, name):
 
 
 def test_policies_without_joints_are_as_before(made, dot, tmp_path):
-    without = replace(config_of(), algorithm=replace(config_of().algorithm, joints=False))
-    with trainer_of(made, tmp_path / "run", without) as trainer:
-        assert trainer.algorithm.in_keys == ["latent", "context"]
-        assert trainer.algorithm.shown is not None
-        trainer.run()
+    trainer = run(made, tmp_path / "run", algorithm={**JOINED, "joints": False})
+    assert trainer.algorithm.in_keys == ["latent", "context"]
+    assert trainer.algorithm.shown is not None
     policy, frame = load_run(tmp_path / "run"), np.full((16, 24, 3), 90, np.uint8)
     policy.condition(np.stack([frame] * 4))
     with pytest.raises(ValueError, match="reads no joints: give it frames alone"):
@@ -188,16 +175,15 @@ def test_policies_without_joints_are_as_before(made, dot, tmp_path):
 
 def test_what_lacks_joints_is_refused_in_a_line(made, monkeypatch, tmp_path, refused):
     dataset, encoders, bank = made
-    run = tmp_path / "run"
+    begin = partial(trainer_of, tmp_path / "run", config=run_config(algorithm=JOINED))
     monkeypatch.setitem(SCENES, "dot", jointed())
     blind = make_bank(encoders, dataset.exclude("joints"), tasks=TASKS)
-    parts = (dataset, encoders, blind)
-    refused(lambda: trainer_of(parts, run), "has no joints of the", "make the bank again")
+    refused(lambda: begin((encoders, blind)), "has no joints of the", "make the bank again")
     other = torch.zeros(len(bank.steps.latent), 3)
-    parts = (dataset, encoders, replace(bank, steps=replace(bank.steps, joints=other)))
-    refused(lambda: trainer_of(parts, run), "has 3 joints", "make the bank again")
+    other = replace(bank, steps=replace(bank.steps, joints=other))
+    refused(lambda: begin((encoders, other)), "has 3 joints", "make the bank again")
     monkeypatch.setitem(SCENES, "dot", scene(SavedDot))
-    refused(lambda: trainer_of(made, run), "has no joints for policies", "set joints to False")
+    refused(lambda: begin((encoders, bank)), "has no joints for policies", "set joints to False")
     frames = np.zeros((3, 16, 24, 3), np.uint8)
     written = {"pixels": frames, "joints": np.zeros((3, 2))}
     options = {"held_out_per_task": 0, "scene": scene()}

@@ -1,30 +1,20 @@
 """One physical robot as an environment, with a dot whose motor moves by .2 of what it can."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from torchrl.envs import check_env_specs
 
-from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.encoders.train import make_pretrained
-from bgpo_trl.experiments.arguments import Arguments
-from bgpo_trl.experiments.run import run_experiment
 from bgpo_trl.policy import load_run
 from bgpo_trl.runs.results import read_table
 from bgpo_trl.scenes import SCENES, Outcome, RobotEnv, SimulationEnv
-from bgpo_trl.training import Trainer
-from tests.helpers import TINY_ENCODERS
-from tests.scenes.dot import SavedDot, scene
+from tests.scenes.dot import SHAPE, TASKS, SavedDot, pretrain, run_config, scene, trainer_of
 
-TASKS = ("left", "right")
 LIMIT = np.float32(0.2)
-SHAPE = {"frame_shape": (16, 24), "action_size": 1}
 
 
 class Limited(SavedDot):
@@ -36,7 +26,7 @@ class Limited(SavedDot):
 
 
 def robot_scene(make=Limited, **changes):
-    return replace(scene(make, **changes), make_env=partial(RobotEnv, make))
+    return scene(make, env=RobotEnv, **changes)
 
 
 def stepped(env, action):
@@ -80,28 +70,9 @@ def test_recordings_hold_the_executed_actions(tmp_path):
 def test_a_run_without_tests_learns_from_what_was_executed(tmp_path, monkeypatch):
     robot = robot_scene()
     monkeypatch.setitem(SCENES, "dot", robot)
-    encoders, bank = make_pretrained(
-        tmp_path / "encoders.safetensors",
-        tmp_path / "shown",
-        folder=tmp_path / "log",
-        scene=robot,
-        config=TINY_ENCODERS,
-        per_task=6,
-        held_out_per_task=2,
-        progress=False,
-    )
-    run = RunConfig(
-        scene="dot",
-        tasks=TASKS,
-        task_starts=(0, 2),
-        seeds=(3,),
-        episodes=4,
-        eval_episodes=0,
-        algorithm=replace(ALGORITHMS["bgpo"].config, max_steps=12),
-    )
-    parts = {"bank": bank, "encoders": encoders, "progress": False}
-    asked = []
-    with Trainer(run, tmp_path / "run", **parts) as trainer:
+    pretrained, asked = pretrain(robot, tmp_path), []
+    config = run_config(seeds=(3,), eval_episodes=0)
+    with trainer_of(tmp_path / "run", pretrained, config) as trainer:
         act = trainer.algorithm.act
 
         def acted(state):
@@ -115,8 +86,8 @@ def test_a_run_without_tests_learns_from_what_was_executed(tmp_path, monkeypatch
     assert torch.cat(asked).abs().max() > LIMIT
     torch.testing.assert_close(held["action"], expected)
     assert not len(read_table(tmp_path / "run" / "eval.csv"))
-    longer = replace(run, episodes=6)  # the dot, unlike most robots, can be saved
-    with Trainer(longer, tmp_path / "run", resume=True, **parts) as trainer:
+    longer = replace(config, episodes=6)  # the dot, unlike most robots, can be saved
+    with trainer_of(tmp_path / "run", pretrained, longer, resume=True) as trainer:
         trainer.run()
     frame = stepped(robot.simulate(TASKS), 0.0)["pixels"].numpy()
     policy = load_run(tmp_path / "run")
@@ -169,12 +140,3 @@ def test_a_setup_is_words_and_leaves_the_rate_to_the_scene():
     for wrong in ({"camera": ""}, {"units": 3}, {"camera": "a\nb"}, {"rate": "5"}):
         with pytest.raises(ValueError, match="setup"):
             robot_scene(setup=wrong)
-
-
-def test_the_command_refuses_a_run_without_tests(tmp_path, refused):
-    arguments = Arguments(out=tmp_path / "run")
-    refused(
-        lambda: run_experiment(arguments, "continual", RunConfig(eval_episodes=0)),
-        "this command draws figures of tests",
-        "set eval_episodes to at least 1",
-    )

@@ -9,13 +9,11 @@ from one_shot import OneShotArguments, one_shot
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
-from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.pretrained import bank_path, load_pretrained
 from bgpo_trl.encoders.representation import save_representation
-from bgpo_trl.encoders.train import make_pretrained, train_encoders
+from bgpo_trl.encoders.train import train_encoders
 from bgpo_trl.evaluation import evaluate_random_policy
 from bgpo_trl.experiments.measure import draw, measure
 from bgpo_trl.experiments.watch import WatchArguments, watch
@@ -23,46 +21,32 @@ from bgpo_trl.modules.vae import VAE
 from bgpo_trl.policy import load_run
 from bgpo_trl.runs.results import read_table
 from bgpo_trl.scenes import SCENES, Outcome, SimulationEnv, StateColumns, find_scene
-from bgpo_trl.training import Trainer
 from tests.helpers import TINY_ENCODERS
-from tests.scenes.dot import Dot, SavedDot, demonstrate, scene
-
-TASKS = ("left", "right")
+from tests.scenes.dot import (
+    SHAPE,
+    TASKS,
+    Dot,
+    SavedDot,
+    demonstrate,
+    pretrain,
+    run_config,
+    scene,
+    trainer_of,
+)
 
 
 @pytest.fixture(scope="module")
 def pretrained(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("dot")
-    return make_pretrained(
-        folder / "encoders.safetensors",
-        folder / "demonstrations",
-        folder=folder / "log",
-        scene=scene(),
-        config=TINY_ENCODERS,
-        per_task=6,
-        held_out_per_task=2,
-        progress=False,
-    )
+    return pretrain(scene(), tmp_path_factory.mktemp("dot"))
 
 
-def config(**changes):
-    algorithm = replace(ALGORITHMS["bgpo"].config, max_steps=12)
-    run = RunConfig(
-        scene="dot",
-        tasks=TASKS,
-        task_starts=(0, 2),
-        seeds=(3, 5),
-        episodes=4,
-        eval_every=2,
-        algorithm=replace(algorithm, rl=replace(algorithm.rl, warmup_steps=12)),
-    )
-    return replace(run, **changes)
+@pytest.fixture
+def dot(monkeypatch):
+    monkeypatch.setitem(SCENES, "dot", scene())
 
 
-def train(directory, pretrained, *, resume=False, **changes):
-    encoders, bank = pretrained
-    options = {"bank": bank, "encoders": encoders, "resume": resume, "progress": False}
-    with Trainer(config(**changes), directory, **options) as trainer:
+def train(directory, pretrained, config=None, **options):
+    with trainer_of(directory, pretrained, config, **options) as trainer:
         trainer.run()
 
 
@@ -108,9 +92,8 @@ def test_a_failed_episode_is_no_success(tmp_path):
     falling = scene(lambda: Falling())
     rate = evaluate_random_policy(tasks=TASKS, episodes=4, max_steps=12, scene=falling)
     assert rate.tolist() == [0.0, 0.0]
-    options = {"per_task": 2, "held_out_per_task": 1, "attempts": 2, "progress": False}
     with pytest.raises(RuntimeError, match="the demonstrator of 'left' failed 2 times in a row"):
-        record_demonstrations(tmp_path, scene=falling, **options)
+        recorded(tmp_path, falling, attempts=2)
 
 
 def test_what_a_scene_lacks_is_refused_in_a_line(tmp_path):
@@ -159,11 +142,11 @@ def test_encoders_of_another_robot_are_refused_whatever_its_version(pretrained, 
             ValueError, match=r"of the scene dot dot-1, this is cart dot-1.*--scene dot"
         ):
             call()
-    run = config(tasks=("grasp_glass", "push_green_to_glass"), scene="nico")
+    run = run_config(tasks=("grasp_glass", "push_green_to_glass"), scene="nico")
     bank = replace(bank, tasks=run.tasks)
     for given, part in ((bank, "the bank"), (replace(bank, scene=None), "encoders")):
         with pytest.raises(ValueError, match=rf"{part} is of the scene dot dot-1, this is nico"):
-            Trainer(run, tmp_path / "run", bank=given, encoders=encoders)
+            trainer_of(tmp_path / "run", (encoders, given), run)
     assert not (tmp_path / "run").exists()
     large = scene(frame_shape=(24, 24))
     with pytest.raises(
@@ -192,24 +175,15 @@ def test_a_run_learns_on_another_robot_and_is_loaded_and_filmed(tmp_path, monkey
     """Its tasks have names that commas and slashes could tear apart."""
     names = tuple(SENTENCES.values())
     short = {name: task for task, name in SENTENCES.items()}
-    told = replace(
-        scene(Told, demonstrator=lambda robot, task, seed: demonstrate(robot, short[task], seed)),
+    told = scene(
+        Told,
+        demonstrator=lambda robot, task, seed: demonstrate(robot, short[task], seed),
         tasks=names,
         default_tasks=names,
     )
     monkeypatch.setitem(SCENES, "dot", told)
-    encoders, bank = make_pretrained(
-        tmp_path / "encoders.safetensors",
-        tmp_path / "demonstrations",
-        folder=tmp_path / "log",
-        scene=told,
-        config=TINY_ENCODERS,
-        per_task=4,
-        held_out_per_task=2,
-        progress=False,
-    )
-    options = {"bank": bank, "encoders": encoders, "progress": False}
-    with Trainer(config(tasks=names), tmp_path / "run", **options) as trainer:
+    encoders, bank = pretrain(told, tmp_path, per_task=4)
+    with trainer_of(tmp_path / "run", (encoders, bank), run_config(tasks=names)) as trainer:
         trainer.run()
         summary = measure(trainer, bank, tmp_path / "run")
         draw(trainer, bank, tmp_path / "run", summary)
@@ -265,17 +239,14 @@ def test_frames_actions_and_episodes_have_any_size(make, n_actions, n_steps, tmp
         ]
         for task in TASKS
     }
-    walker = replace(scene(make, **shape), max_steps=n_steps)
+    walker = scene(make, max_steps=n_steps, **shape)
     monkeypatch.setitem(SCENES, "dot", walker)
     dataset = write_demonstrations(tmp_path / "own", shown, scene=walker, held_out_per_task=1)
     paths = tmp_path / "encoders.safetensors", tmp_path / "log"
     options = {"scene": walker, "progress": False}
     pretrained = train_encoders(dataset, None, *paths, TINY_ENCODERS, **options)
-    algorithm = config().algorithm
-    rl = replace(algorithm.rl, warmup_steps=n_steps)
-    algorithm = replace(algorithm, max_steps=n_steps, rl=rl)
-    train(tmp_path / "run", pretrained, algorithm=algorithm, episodes=2)
-
+    config = run_config(algorithm={"max_steps": n_steps}, episodes=2)
+    train(tmp_path / "run", pretrained, config)
     steps = read_table(tmp_path / "run" / "train.csv")["steps"].astype(int)
     assert steps.max() == n_steps
     policy = load_run(tmp_path / "run")
@@ -352,26 +323,20 @@ def test_actions_of_a_demonstrator_are_checked_as_those_of_a_dataset(tmp_path, a
         recorded(tmp_path, bold, tasks=["right"])
 
 
-def test_a_run_whose_encoders_could_not_be_loaded_again_does_not_begin(
-    pretrained, tmp_path, monkeypatch
-):
+def test_a_run_whose_encoders_could_not_be_loaded_again_does_not_begin(pretrained, dot, tmp_path):
     class Mine(VAE):
         """A frame encoder that sees something else than its weights say."""
 
         def features(self, frames):
             return super().features(255 - frames)
 
-    monkeypatch.setitem(SCENES, "dot", scene())
     encoders, bank = pretrained
     mine = Mine(64, 1, (16, 24))
     mine.load_state_dict(encoders.frame_network.state_dict())
-    with pytest.raises(
-        ValueError, match=r"could be saved, but not loaded again .*depends on more than"
-    ):
-        train(
-            tmp_path / "run",
-            (replace(encoders, frame_network=mine), replace(bank, encoder_id=None)),
-        )
+    parts = replace(encoders, frame_network=mine), replace(bank, encoder_id=None)
+    refusal = r"could be saved, but not loaded again .*depends on more than"
+    with pytest.raises(ValueError, match=refusal):
+        trainer_of(tmp_path / "run", parts)
     assert not (tmp_path / "run").exists()
 
 
@@ -385,13 +350,11 @@ def test_a_scene_without_a_simulation_serves_demonstrations(tmp_path):
         bare.simulate(TASKS)
 
 
-def test_episodes_are_no_longer_than_those_of_the_scene(pretrained, tmp_path, monkeypatch):
-    monkeypatch.setitem(SCENES, "dot", scene())
-    algorithm = replace(ALGORITHMS["bgpo-experts"].config, max_steps=13)
-    with pytest.raises(
-        ValueError, match="max_steps is 13, episodes of the scene 'dot' have at most 12"
-    ):
-        train(tmp_path / "run", pretrained, algorithm=algorithm)
+def test_episodes_are_no_longer_than_those_of_the_scene(pretrained, dot, tmp_path):
+    config = run_config(algorithm={"max_steps": 13})
+    refusal = "max_steps is 13, episodes of the scene 'dot' have at most 12"
+    with pytest.raises(ValueError, match=refusal):
+        trainer_of(tmp_path / "run", pretrained, config)
 
     class Stuck(Dot):
         steps = 0
@@ -405,24 +368,14 @@ def test_episodes_are_no_longer_than_those_of_the_scene(pretrained, tmp_path, mo
 
 
 def test_a_ground_truth_that_the_simulation_does_not_have_is_named():
-    shape = {"frame_shape": (16, 24), "action_size": 1}
-    env = SimulationEnv(Dot, TASKS, state_size=1, observation="both", **shape)
+    env = SimulationEnv(Dot, TASKS, state_size=1, observation="both", **SHAPE)
     with pytest.raises(NotImplementedError, match=r"Dot does not define state\(\)"):
         env.reset()
 
 
-@pytest.mark.parametrize("name", ["dist-nll-demonstrations", "maml"])
-def test_baselines_learn_on_another_robot(pretrained, tmp_path, monkeypatch, name):
-    monkeypatch.setitem(SCENES, "dot", scene())
-    algorithm = replace(ALGORITHMS[name].config, max_steps=12)
-    train(tmp_path, pretrained, name=name, algorithm=algorithm, schedule="sequential")
-    assert len(read_table(tmp_path / "train.csv")) == 8
-
-
-def test_a_run_whose_simulation_cannot_be_saved_is_not_resumed(pretrained, tmp_path, monkeypatch):
-    monkeypatch.setitem(SCENES, "dot", scene())
-    train(tmp_path, pretrained, episodes=2)
+def test_a_run_whose_simulation_cannot_be_saved_is_not_resumed(pretrained, dot, tmp_path):
+    train(tmp_path, pretrained, run_config(episodes=2))
     before = (tmp_path / "train.csv").read_bytes()
     with pytest.raises(ValueError, match="'dot' cannot be saved, so this run cannot be resumed"):
-        train(tmp_path, pretrained, resume=True)
+        trainer_of(tmp_path, pretrained, resume=True)
     assert (tmp_path / "train.csv").read_bytes() == before
