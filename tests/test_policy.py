@@ -21,7 +21,7 @@ from bgpo_trl.encoders.representation import save_representation
 from bgpo_trl.scenes.nico import NICO
 from bgpo_trl.training import Trainer
 from suites import nico
-from tests.helpers import contents, edit
+from tests.helpers import edit
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 ROOT = Path(__file__).parents[1]
@@ -115,8 +115,10 @@ def test_a_loaded_policy_acts_as_a_snapshot(trainer_of, load, encoders, name):
 
 @pytest.mark.parametrize("length", [1, 51, 70])
 def test_recognition_of_demonstrations_of_any_length(trainer_of, load, encoders, length):
+    """Which leaves GWR-B as it is."""
     algorithm, config = trainer_of("bgpo").algorithm, trainer_of("bgpo").config.algorithm
     policy, frames = load(seed=8), noise(9, 70)[:length]
+    assert load().episodes == 10
     seen = policy.condition(frames)
     assert torch.allclose(seen.embedding, embed(encoders, frames), atol=1e-6)
     graph = algorithm.gwr.graph(1)
@@ -129,62 +131,57 @@ def test_recognition_of_demonstrations_of_any_length(trainer_of, load, encoders,
     assert (seen.group, seen.group_novelty) == (int(member.group), float(member.novelty))
     assert seen.known == (seen.group_novelty <= 1)
     assert policy.act(frames[-1]).shape == (4,)
+    assert policy.algorithm.gwr.num_nodes.equal(algorithm.gwr.num_nodes)
 
 
-@pytest.mark.parametrize("name", ["bgpo", "without-gwr", "dist-nll-demonstrations"])
-def test_an_exported_policy_acts_as_before_in_a_process_without_the_package(load, tmp_path, name):
-    policy, path = load(name), tmp_path / "policy.pt2"
+_ACT = {
+    "pt2": """
+import json, sys, numpy as np, torch
+files = {"bgpo_trl.json": ""}
+act = torch.export.load("policy.pt2", extra_files=files).module()
+np.save("actions.npy", [act(torch.from_numpy(frame)).numpy() for frame in np.load("frames.npy")])
+print(json.dumps([json.loads(files["bgpo_trl.json"]), "bgpo_trl" in sys.modules]))
+""",
+    "onnx": """
+import json, sys, numpy as np, onnxruntime
+session = onnxruntime.InferenceSession("policy.onnx")
+np.save("actions.npy", [session.run(None, {"frame": f})[0] for f in np.load("frames.npy")])
+about = json.loads(session.get_modelmeta().custom_metadata_map["bgpo_trl.json"])
+print(json.dumps([about, "torch" in sys.modules]))
+""",
+}
+"""Programs that save actions for ``frames.npy``, and print metadata and if they need our code."""
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("bgpo", "pt2"),
+        ("without-gwr", "pt2"),
+        ("dist-nll-demonstrations", "pt2"),
+        ("bgpo", "onnx"),
+        ("dist-nll-demonstrations", "onnx"),
+    ],
+)
+def test_an_exported_policy_acts_as_before_in_a_process_without_the_package(
+    load, tmp_path, name, kind
+):
+    policy, path, frames = load(name), tmp_path / f"policy.{kind}", noise(7, 3)
     with pytest.raises(ValueError, match="has seen no demonstration"):
         policy.export(path)
     policy.condition(DEMONSTRATIONS[1], task=TASKS[1])
     with pytest.raises(ValueError, match=r"end its name in .pt2 or .onnx"):
         policy.export(tmp_path / "policy")
     policy.export(path)
-    frames = noise(7, 3)
     np.save(tmp_path / "frames.npy", frames)
-    code = (
-        "import sys, numpy as np, torch\n"
-        "about = {'bgpo_trl.json': ''}\n"
-        "act = torch.export.load('policy.pt2', extra_files=about).module()\n"
-        "actions = [act(torch.from_numpy(frame)) for frame in np.load('frames.npy')]\n"
-        "np.save('actions.npy', torch.stack(actions).numpy())\n"
-        "print('bgpo_trl' in sys.modules, about['bgpo_trl.json'])\n"
-    )
-    found = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
-    imported, about = found.stdout.split(maxsplit=1)
-    assert imported == "False"
-    assert json.loads(about) == {"scene": NICO.identity, "rate": 5.0, "tasks": [*TASKS]}
+    program = [sys.executable, "-c", _ACT[kind]]
+    found = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, check=True)
+    about = {"scene": NICO.identity, "rate": 5.0, "tasks": [*TASKS]}
+    assert json.loads(found.stdout) == [about, False]
+    assert [*tmp_path.glob("policy*")] == [path]
     expected = [policy.act(frame) for frame in frames]
     np.testing.assert_allclose(np.load(tmp_path / "actions.npy"), expected, rtol=0, atol=1e-5)
     assert np.ptp(expected, axis=0).max() > 1e-4  # the frame matters
-
-
-_RUN_ONNX = """
-import json, sys, numpy as np, onnxruntime
-session = onnxruntime.InferenceSession("policy.onnx")
-frames = np.load("frames.npy")
-np.save("actions.npy", [session.run(None, {"frame": frame})[0] for frame in frames])
-about = json.loads(session.get_modelmeta().custom_metadata_map["bgpo_trl.json"])
-print(json.dumps([about, "torch" in sys.modules]))
-"""
-
-
-@pytest.mark.parametrize("name", ["bgpo", "dist-nll-demonstrations"])
-def test_an_onnx_model_acts_as_the_policy_in_a_process_without_torch(load, tmp_path, name):
-    policy, frames = load(name), noise(7, 3)
-    policy.condition(DEMONSTRATIONS[1], task=TASKS[1])
-    policy.export(tmp_path / "policy.onnx")
-    np.save(tmp_path / "frames.npy", frames)
-    found = subprocess.run(
-        [sys.executable, "-c", _RUN_ONNX], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
-    about = {"scene": NICO.identity, "rate": 5.0, "tasks": [*TASKS]}
-    assert json.loads(found.stdout) == [about, False]
-    assert sorted(path.name for path in tmp_path.glob("policy*")) == ["policy.onnx"]
-    expected = [policy.act(frame) for frame in frames]
-    np.testing.assert_allclose(np.load(tmp_path / "actions.npy"), expected, rtol=0, atol=1e-5)
 
 
 def test_onnx_without_the_extra_is_refused_in_one_line(load, tmp_path, monkeypatch):
@@ -253,19 +250,6 @@ def test_only_algorithms_that_do_not_infer_the_task_need_its_label(load, name):
             policy.condition(DEMONSTRATIONS[0], task=wrong)
     seen = policy.condition(DEMONSTRATIONS[0], task=TASKS[1])
     assert (seen.task, seen.node) == (TASKS[1], None)
-
-
-def test_a_loaded_policy_changes_neither_the_run_nor_gwr_b(trainer_of, load):
-    run = trainer_of("bgpo").directory
-    before = contents(run)
-    policy = load()
-    nodes = policy.algorithm.gwr.num_nodes
-    for frames in DEMONSTRATIONS:
-        policy.condition(frames)
-    policy.act(frames[0])
-    assert policy.algorithm.gwr.num_nodes.equal(nodes)
-    assert contents(run) == before
-    assert policy.episodes == 10
 
 
 @pytest.mark.parametrize(
