@@ -4,7 +4,6 @@ import importlib
 import sys
 import unittest
 import unittest.mock
-from collections.abc import Callable, Iterator
 
 import gymnasium
 import numpy as np
@@ -15,7 +14,7 @@ from dm_env import test_utils
 from gymnasium.utils.env_checker import check_env
 from shimmy import DmControlCompatibilityV0
 from tensordict import TensorDict
-from torchrl.envs import DMControlEnv, DMControlWrapper, check_env_specs
+from torchrl.envs import DMControlEnv, check_env_specs
 
 from suites import nico
 
@@ -98,16 +97,18 @@ def test_registered_tasks_are_listed_once_and_other_suites_stay_unchanged(regist
     assert {**domains, "nico": tasks} == suite.TASKS_BY_DOMAIN
 
 
-def test_torchrl_wraps_seeds_and_checks(load):
-    env = DMControlWrapper(load("push_white_left", observation="both"))
+def test_torchrl_finds_seeds_and_checks_registered_tasks(registered, renderer):
+    assert {*nico.ALL_TASKS} <= {*dict(DMControlEnv.available_envs)["nico"]}
+    env = DMControlEnv("nico", "push_white_left", observation="both", renderer=renderer)
+    check_env_specs(env)
 
     def play(seed: int) -> TensorDict:
         env.set_seed(seed)
         torch.manual_seed(0)
         return env.rollout(3)
 
-    check_env_specs(env)
     first, second, other = play(3), play(3), play(4)
+    assert first["next", "reward"].shape == (3, 1)
     for key in ("pixels", "privileged_state"):
         assert first[key].shape == (3, *env.observation_spec[key].shape)
         assert first[key].dtype == env.observation_spec[key].dtype
@@ -115,31 +116,17 @@ def test_torchrl_wraps_seeds_and_checks(load):
         assert not torch.equal(first[key], other[key])
 
 
-def test_torchrl_finds_registered_tasks(registered, renderer):
-    env = DMControlEnv("nico", "push_white_left", renderer=renderer)
-    env.set_seed(0)
-    rollout = env.rollout(3)
-    assert rollout["pixels"].shape == (3, 32, 64, 3)
-    assert rollout["next", "reward"].shape == (3, 1)
-    assert {*nico.ALL_TASKS} <= {*dict(DMControlEnv.available_envs)["nico"]}
-
-
-@pytest.fixture
-def make_gym(renderer) -> Iterator[Callable[..., gymnasium.Env]]:
-    """Make tasks through Gymnasium's registry, since it checks registered environments further."""
-
-    def make(task: str, **options) -> gymnasium.Env:
-        shared = None if "frame_size" in options else renderer
-        return DmControlCompatibilityV0(nico.load(task, renderer=shared, **options))
-
-    gymnasium.register("nico-v0", make)
-    yield lambda task, **options: gymnasium.make("nico-v0", task=task, **options).unwrapped
-    del gymnasium.registry["nico-v0"]
-
-
 # An unbounded state is no mistake; the windows it would open are not ours.
 @pytest.mark.filterwarnings("ignore:.*A Box observation space m.*imum value is:UserWarning")
-def test_gymnasiums_checks_pass_through_shimmy(make_gym):
-    env = make_gym("push_white_left", observation="both")
+def test_gymnasiums_checks_pass_through_shimmy(renderer, monkeypatch):
+    """Through Gymnasium's registry, since it checks registered environments further."""
+
+    def make() -> gymnasium.Env:
+        env = nico.load("push_white_left", observation="both", renderer=renderer)
+        return DmControlCompatibilityV0(env)
+
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", {})
+    gymnasium.register("nico-v0", make)
+    env = gymnasium.make("nico-v0").unwrapped
     check_env(env, skip_render_check=True)
     assert set(env.observation_space) == {"pixels", "privileged_state"}
