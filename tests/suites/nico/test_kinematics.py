@@ -22,7 +22,7 @@ def test_inverse_kinematics_agrees_with_the_simulation(physics, site, point):
         place = kinematics.polar(random.uniform(0.25, 0.42), random.uniform(-0.7, 0.7))
         target = np.append(place, TABLE_HEIGHT + random.uniform(0.02, 0.15))
         set_arm(physics, kinematics.inverse(target, point))
-        np.testing.assert_allclose(physics.named.data.site_xpos[site], target, atol=1e-3)
+        np.testing.assert_allclose(physics.named.data.site_xpos[site], target, atol=1e-9)
 
 
 def test_targets_out_of_reach_are_approached_with_a_straight_arm(physics):
