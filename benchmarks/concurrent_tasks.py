@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bgpo_trl.experiments.command_line import command_line
-from bgpo_trl.experiments.paper import concurrent
+from bgpo_trl.experiments.run import concurrent
 
 if __name__ == "__main__":
     command_line(concurrent)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bgpo_trl.experiments.command_line import command_line
-from bgpo_trl.experiments.paper import continual
+from bgpo_trl.experiments.run import continual
 
 if __name__ == "__main__":
     command_line(continual)

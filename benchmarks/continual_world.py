@@ -23,8 +23,7 @@ from bgpo_trl.configs import (
     VAEConfig,
 )
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.encoders.make_bank import make_bank
-from bgpo_trl.encoders.train import train_encoders
+from bgpo_trl.encoders.train import make_bank, train_encoders
 from bgpo_trl.experiments.arguments import Arguments, ReportArguments
 from bgpo_trl.experiments.command_line import import_plugin
 from bgpo_trl.experiments.report import report

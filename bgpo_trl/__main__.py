@@ -20,15 +20,15 @@ COMMANDS: dict[str, dict[str, tuple[str, type]]] = {
         "probes": ("experiments.make_data", arguments.ProbesArguments),
     },
     "run": {
-        "continual": ("experiments.paper", arguments.Arguments),
-        "concurrent": ("experiments.paper", arguments.Arguments),
+        "continual": ("experiments.run", arguments.Arguments),
+        "concurrent": ("experiments.run", arguments.Arguments),
         "sweep": ("experiments.sweep", arguments.SweepArguments),
         "doctor": ("experiments.doctor", arguments.DoctorArguments),
     },
     "look": {
         "report": ("experiments.report", arguments.ReportArguments),
         "watch": ("experiments.watch", arguments.WatchArguments),
-        "one-shot": ("experiments.one_shot", arguments.OneShotArguments),
+        "one-shot": ("experiments.watch", arguments.OneShotArguments),
         "groups": ("experiments.groups", arguments.GroupsArguments),
     },
 }

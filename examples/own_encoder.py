@@ -19,8 +19,8 @@ from bgpo_trl.configs import (
 )
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.fitting import train_representation
-from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.probes import probe
+from bgpo_trl.encoders.train import make_bank
 from bgpo_trl.modules.frame_network import FRAME_NETWORKS, FrameNetwork
 from bgpo_trl.scenes import find_scene
 from bgpo_trl.training import Trainer

@@ -8,8 +8,8 @@ from pathlib import Path
 from bgpo_trl.analysis.task_inference import task_inference_accuracy
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.encoders.train import make_bank
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import plot_success_curves
 from bgpo_trl.runs.results import read_run

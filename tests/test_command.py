@@ -84,7 +84,7 @@ def test_experiments_keep_the_command_that_repeats_them(tmp_path, monkeypatch, n
     def run_experiment(arguments, experiment, config):
         ran.append((list(sys.argv), experiment, config.task_starts))
 
-    monkeypatch.setattr("bgpo_trl.experiments.paper.run_experiment", run_experiment)
+    monkeypatch.setattr("bgpo_trl.experiments.run.run_experiment", run_experiment)
     call(monkeypatch, name, "--preset", "smoke")
     assert ran == [(["-m", "bgpo_trl", name, "--preset", "smoke"], name, tasks)]
 

@@ -8,11 +8,10 @@ from tensordict import TensorDict
 
 from bgpo_trl.data.dataset import load_demonstrations, read_meta
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.pretrained import default_weights
 from bgpo_trl.encoders.probes import probe
 from bgpo_trl.encoders.representation import load_representation
-from bgpo_trl.encoders.train import train_encoders
+from bgpo_trl.encoders.train import make_bank, train_encoders
 from bgpo_trl.experiments.arguments import (
     EncodersArguments,
     MakeBankArguments,

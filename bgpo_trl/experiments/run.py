@@ -1,4 +1,4 @@
-"""One run of the paper's experiments, from the encoders to the figures."""
+"""The paper's experiments: one run, from the encoders to the figures."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from bgpo_trl.experiments.settings import (
     chosen_scene,
     chosen_tasks,
     named_directory,
+    run_config,
 )
 from bgpo_trl.files.writing import lock_directory, write_json
 from bgpo_trl.machine import choose_device, keep_freed_memory, set_threads
@@ -39,6 +40,16 @@ from bgpo_trl.scenes import Scene, find_scene
 from bgpo_trl.training import Trainer
 
 _DATASET = "demonstrations"  # folder of a run that trains its encoders
+
+
+def continual(arguments: Arguments) -> str:
+    """Train an algorithm on tasks that are presented one after the other (Fig. 8)."""
+    return run_experiment(arguments, "continual", run_config(arguments))
+
+
+def concurrent(arguments: Arguments) -> str:
+    """Train an algorithm on tasks that are all presented from the start (Figs. 6 and 9)."""
+    return run_experiment(arguments, "concurrent", run_config(arguments, from_start=True))
 
 
 def run_experiment(

@@ -1,4 +1,4 @@
-"""Film of a run's trained policies beside the demonstrations that they were shown."""
+"""Trained policies at work: a film beside demonstrations, and one shot from a film of others."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
+from bgpo_trl.data.film import read_film
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.experiments.arguments import WatchArguments
+from bgpo_trl.experiments.arguments import OneShotArguments, WatchArguments
 from bgpo_trl.figures.frames import plot_frame_strips, save_gif
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.writing import check_folder
-from bgpo_trl.policy import TrainedPolicy, load_run
+from bgpo_trl.policy import Recognition, TrainedPolicy, load_run
 from bgpo_trl.scenes import Scene, Simulation, find_scene
 from bgpo_trl.scenes.scene import checked_frame, checked_numbers, checked_step
 
@@ -167,3 +168,27 @@ def watch(arguments: WatchArguments) -> str:
     outcomes = [f"{episode.task}: {episode.outcome}" for episode in episodes]
     learned = f"seed {policy.seed} after {policy.episodes:,} training episodes"
     return "\n".join([learned, *outcomes, f"pictures: {out}"])
+
+
+def one_shot(arguments: OneShotArguments) -> str:
+    """Show a policy a demonstration; return what it recognizes and, if asked for, achieves."""
+    policy = load_run(arguments.run, seed=arguments.run_seed)
+    film = read_film(arguments.demonstration)
+    frames = policy.preprocess(film, color="rgb", crop=arguments.crop)
+    lines = [f"{len(frames)} frames of {film.shape[1]} x {film.shape[2]}"]
+    lines += _recognized(policy.condition(frames, task=arguments.task))
+    if arguments.task is None:
+        return "\n".join([*lines, "--task NAME plays it in the simulation"])
+    find_scene(policy.config.scene).check_tasks([arguments.task])
+    episode = play(policy, arguments.task, frames, arguments.scene_seed)
+    return "\n".join([*lines, f"{arguments.task}: {episode.outcome}"])
+
+
+def _recognized(found: Recognition) -> list[str]:
+    lines = []
+    if found.node is not None:
+        lines.append(f"behavior: node {found.node} of GWR-B, activity {found.activity:.2f}")
+    if found.group is not None:
+        novel = "within the group" if found.known else "unlike what the group was shown"
+        lines.append(f"group {found.group}, novelty {found.group_novelty:.2f}: {novel}")
+    return lines or ["the algorithm has neither GWR-B nor groups: nothing is inferred"]

@@ -7,8 +7,8 @@ import torch
 
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.encoders.train import make_bank
 from bgpo_trl.experiments import make_data
 from bgpo_trl.experiments.arguments import MakeBankArguments
 from bgpo_trl.files.tensor_file import load_tensors, save_tensors

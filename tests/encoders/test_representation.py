@@ -18,7 +18,6 @@ from bgpo_trl.configs import (
     VAEConfig,
 )
 from bgpo_trl.encoders.fitting import retrain_inverse, train_representation
-from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.probes import _probe_reconstruction, probe
 from bgpo_trl.encoders.representation import (
     Representation,
@@ -28,7 +27,7 @@ from bgpo_trl.encoders.representation import (
     split,
     valid_frames,
 )
-from bgpo_trl.encoders.train import train_encoders
+from bgpo_trl.encoders.train import make_bank, train_encoders
 from bgpo_trl.scenes.nico import NICO
 from tests.helpers import TINY_ENCODERS
 from tests.scenes.dot import scene

@@ -7,7 +7,7 @@ from PIL import Image
 import bgpo_trl
 from bgpo_trl.data.film import read_film
 from bgpo_trl.experiments.arguments import OneShotArguments
-from bgpo_trl.experiments.one_shot import one_shot
+from bgpo_trl.experiments.watch import one_shot
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 FRAMES = np.random.default_rng(0).integers(256, size=(11, 64, 128, 3), dtype=np.uint8)

@@ -11,8 +11,8 @@ from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.experiments.command_line import import_plugin
-from bgpo_trl.experiments.paper import continual
 from bgpo_trl.experiments.report import ReportArguments, report
+from bgpo_trl.experiments.run import continual
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.runs.results import read_table
 from suites import nico

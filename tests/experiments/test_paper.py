@@ -19,8 +19,8 @@ from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis.comparison import NAMES
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.experiments.arguments import Arguments
-from bgpo_trl.experiments.paper import concurrent, continual
 from bgpo_trl.experiments.report import ReportArguments, report
+from bgpo_trl.experiments.run import concurrent, continual
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.results import read_table
 from suites import nico

@@ -14,8 +14,7 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
 from bgpo_trl.data.lerobot import read_lerobot, write_lerobot
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.encoders.make_bank import make_bank
-from bgpo_trl.encoders.train import train_encoders
+from bgpo_trl.encoders.train import make_bank, train_encoders
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.policy import load_run
 from bgpo_trl.scenes import SCENES, StateColumns
