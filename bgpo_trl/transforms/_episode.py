@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, Transform, TransformedEnv
@@ -48,21 +48,21 @@ class EpisodeTransform(Transform):
     same reset, also in each worker of a ``ParallelEnv``. With any other base environment, call
     `seed_rows`.
 
-    Args:
-        in_keys: Entries read.
-        out_keys: Entries written.
-
     Attributes:
+        reads: Entries read; TorchRL's ``RenameTransform`` serves environments with other names.
+        writes: Entries written.
         learn: Whether it learns at the end of an episode.
         changes_reward: Whether it changes the reward.
     """
 
+    reads: ClassVar[Sequence[str]] = ()
+    writes: ClassVar[Sequence[str]] = ()
     learn: bool = False
     changes_reward: bool = False
     _seeding: Seeding | None = None
 
-    def __init__(self, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]) -> None:
-        super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
+    def __init__(self) -> None:
+        super().__init__(in_keys=[*self.reads], out_keys=[*self.writes])
 
     def seed_rows(self, seeds: Sequence[int]) -> None:
         """Start random streams anew, from a seed for each row; this base class has none."""
@@ -88,16 +88,13 @@ class EpisodeTransform(Transform):
         self._follow_seed()  # A seed set earlier must not undo the load at the next reset.
         super()._load_from_state_dict(*args, **kwargs)
 
-    def _entries(self, observation_spec: Composite) -> dict[NestedKey, TensorSpec]:
+    def _entries(self, observation_spec: Composite) -> dict[str, TensorSpec]:
         """Return the specs of the entries written, given the observation so far."""
         raise NotImplementedError
 
-    def _read_spec(self, observation_spec: Composite, key: NestedKey, source: str) -> TensorSpec:
+    def _read_spec(self, observation_spec: Composite, key: str, source: str) -> TensorSpec:
         if key not in observation_spec.keys(True, True):
-            raise ValueError(
-                f"{type(self).__name__} found no {key!r}: put {source} before it, or give another "
-                "key in in_keys"
-            )
+            raise ValueError(f"{type(self).__name__} found no {key!r}: put {source} before it")
         return observation_spec[key]
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:

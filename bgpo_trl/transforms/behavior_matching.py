@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
@@ -39,8 +38,6 @@ class BehaviorMatchingReward(EpisodeTransform):
     Args:
         lae: The autoencoder; called without gradient.
         beta: Weight of the intrinsic reward, which is measured even if 0.
-        in_keys: Keys of latent, behavior and reward.
-        out_keys: Keys of the two parts of the LSTM's state and of the two parts of the reward.
 
     Raises:
         ValueError: If beta is negative, or latents, behaviors or rewards are missing or of another
@@ -67,19 +64,14 @@ class BehaviorMatchingReward(EpisodeTransform):
         True
     """
 
+    reads = ("latent", "behavior", "reward")
+    writes = ("lae_h", "lae_c", "extrinsic_reward", "intrinsic_reward")
     changes_reward = True
 
-    def __init__(
-        self,
-        lae: SequenceAutoencoder,
-        beta: float = 0.1,
-        *,
-        in_keys: Sequence[NestedKey] = ("latent", "behavior", "reward"),
-        out_keys: Sequence[NestedKey] = ("lae_h", "lae_c", "extrinsic_reward", "intrinsic_reward"),
-    ) -> None:
+    def __init__(self, lae: SequenceAutoencoder, beta: float = 0.1) -> None:
         if not 0 <= beta < math.inf:
             raise ValueError(f"beta must not be negative, got {beta}")
-        super().__init__(in_keys, out_keys)
+        super().__init__()
         self.lae = lae
         self.beta = beta
 
@@ -88,30 +80,28 @@ class BehaviorMatchingReward(EpisodeTransform):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         # The state has the size of phi_g, and so of the behavior.
-        zeros = torch.zeros_like(tensordict_reset[self.in_keys[1]])
-        self._read(tensordict_reset[self.in_keys[0]], zeros, zeros, tensordict_reset)
+        zeros = torch.zeros_like(tensordict_reset["behavior"])
+        self._read(tensordict_reset["latent"], zeros, zeros, tensordict_reset)
         return tensordict_reset
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        latent_key, behavior_key, reward_key = self.in_keys
-        h_key, c_key, extrinsic_key, intrinsic_key = self.out_keys
-        h, c = tensordict.get(h_key), tensordict.get(c_key)
-        phi = self._read(next_tensordict.get(latent_key), h, c, next_tensordict)
+        h, c = tensordict.get("lae_h"), tensordict.get("lae_c")
+        phi = self._read(next_tensordict.get("latent"), h, c, next_tensordict)
         stepped = tensordict.get("_step", None)
         if stepped is not None:
             rows = stepped.reshape(*phi.shape[:-1], 1)
-            for key, before in ((h_key, h), (c_key, c)):
+            for key, before in (("lae_h", h), ("lae_c", c)):
                 next_tensordict.set(key, torch.where(rows, next_tensordict.get(key), before))
-        extrinsic = next_tensordict.get(reward_key)
+        extrinsic = next_tensordict.get("reward")
         intrinsic = torch.zeros_like(extrinsic)
         ended = ending(tensordict, next_tensordict)
         if ended.any():
-            bonus = torch.where(ended, matching_reward(tensordict.get(behavior_key), phi), 0)
+            bonus = torch.where(ended, matching_reward(tensordict.get("behavior"), phi), 0)
             intrinsic = bonus.unsqueeze(-1).to(extrinsic.dtype)
-        next_tensordict.set(extrinsic_key, extrinsic)
-        next_tensordict.set(intrinsic_key, intrinsic)
-        return next_tensordict.set(reward_key, extrinsic + self.beta * intrinsic)
+        next_tensordict.set("extrinsic_reward", extrinsic)
+        next_tensordict.set("intrinsic_reward", intrinsic)
+        return next_tensordict.set("reward", extrinsic + self.beta * intrinsic)
 
     def _read(self, z: Tensor, h: Tensor, c: Tensor, into: TensorDictBase) -> Tensor:
         # Simulations are on the CPU, even if the encoder is not.
@@ -120,28 +110,25 @@ class BehaviorMatchingReward(EpisodeTransform):
             h, c = self.lae.step(z, h, c)
         else:
             h, c = (x.to(z.device) for x in self.lae.step(z.to(device), h.to(device), c.to(device)))
-        into.set(self.out_keys[0], h).set(self.out_keys[1], c)
+        into.set("lae_h", h).set("lae_c", c)
         return h
 
-    def _entries(self, observation_spec: Composite) -> dict[NestedKey, TensorSpec]:
-        latent = self._read_spec(observation_spec, self.in_keys[0], "FrameEncoder")
-        behavior = self._read_spec(observation_spec, self.in_keys[1], "BehaviorLookup")
+    def _entries(self, observation_spec: Composite) -> dict[str, TensorSpec]:
+        latent = self._read_spec(observation_spec, "latent", "FrameEncoder")
+        behavior = self._read_spec(observation_spec, "behavior", "BehaviorLookup")
         sizes = latent.shape[-1], behavior.shape[-1]
         if sizes != (self.lae.latent_size, self.lae.embedding_size):
             raise ValueError(
                 f"latents and behaviors have sizes {sizes}, but the sequence encoder was made for "
                 f"{self.lae.latent_size} and {self.lae.embedding_size}: use a pair trained together"
             )
-        return {key: behavior.clone() for key in self.out_keys[:2]}
+        return {"lae_h": behavior.clone(), "lae_c": behavior.clone()}
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
         """Add the parts of the reward and unbound their sum."""
-        reward_key = self.in_keys[2]
-        if reward_key not in reward_spec.keys(True, True):
-            raise ValueError(f"the environment has no {reward_key!r}: give its reward in in_keys")
-        extrinsic = reward_spec[reward_key]
+        extrinsic = self._read_spec(reward_spec, "reward", "an environment with one")
         like = {"shape": extrinsic.shape, "device": extrinsic.device, "dtype": extrinsic.dtype}
-        reward_spec[self.out_keys[2]] = extrinsic.clone()
-        reward_spec[self.out_keys[3]] = Bounded(low=0.0, high=1.0, **like)
-        reward_spec[reward_key] = Unbounded(**like)
+        reward_spec["extrinsic_reward"] = extrinsic.clone()
+        reward_spec["intrinsic_reward"] = Bounded(low=0.0, high=1.0, **like)
+        reward_spec["reward"] = Unbounded(**like)
         return reward_spec

@@ -9,7 +9,7 @@ from typing import Protocol, Self
 
 import numpy as np
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
@@ -121,7 +121,6 @@ class DemonstrationSource(EpisodeTransform):
         batch_size: Batch size of the environment, or its length; ``()`` is a single one.
         generator: Source of the streams, one for all rows or one per row, used only on
             construction; None: torch's default generator. ``env.set_seed`` replaces the streams.
-        out_keys: Keys of task, embedding and index.
 
     Raises:
         ValueError: If the bank has wrong shapes or no demonstration of a task, the number of
@@ -140,6 +139,7 @@ class DemonstrationSource(EpisodeTransform):
         tensor(1)
     """
 
+    writes = ("task", "demo_embedding", "demo_index")
     episode: Tensor
     _stream: Tensor
     _embedding: Tensor
@@ -153,9 +153,8 @@ class DemonstrationSource(EpisodeTransform):
         *,
         batch_size: int | Sequence[int] = (),
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
-        out_keys: Sequence[NestedKey] = ("task", "demo_embedding", "demo_index"),
     ) -> None:
-        super().__init__((), out_keys)
+        super().__init__()
         batch_size = as_shape(batch_size, "batch_size")
         n_rows = batch_size.numel()
         if bank.embedding.ndim != 2 or bank.task.shape != bank.embedding.shape[:1]:
@@ -209,49 +208,45 @@ class DemonstrationSource(EpisodeTransform):
         if tensordict is None:
             tensordict = TensorDict({}, self.episode.shape, device=self.episode.device)
         self._draw(starting(tensordict))
-        return tensordict.set(self.out_keys[0], self._task[self._demo_index].clone())
+        return tensordict.set("task", self._task[self._demo_index].clone())
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        task_key, embedding_key, index_key = self.out_keys
         # Copies: without batch dimensions, indexing returns views of the bank.
         task = self._task[self._demo_index].clone()
-        reported = tensordict_reset.get(task_key, None)
+        reported = tensordict_reset.get("task", None)
         if reported is None:
-            tensordict_reset.set(task_key, task)
+            tensordict_reset.set("task", task)
         elif (reported.reshape(task.shape) != task)[starting(tensordict)].any():
             raise ValueError(
-                f"the environment did not take the task drawn for it: it must read {task_key!r} "
-                "from the TensorDict it is reset with, and have it in its state_spec"
+                "the environment did not take the task drawn for it: it must read 'task' from the "
+                "TensorDict it is reset with, and have it in its state_spec"
             )
-        tensordict_reset.set(embedding_key, self._embedding[self._demo_index].clone())
-        return tensordict_reset.set(index_key, self._demo_index.clone())
+        tensordict_reset.set("demo_embedding", self._embedding[self._demo_index].clone())
+        return tensordict_reset.set("demo_index", self._demo_index.clone())
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        task_key, *own_keys = self.out_keys
-        if next_tensordict.get(task_key, None) is None:
-            own_keys.append(task_key)
-        for key in own_keys:
-            next_tensordict.set(key, tensordict.get(key))
+        for key in self.writes:
+            if key != "task" or next_tensordict.get("task", None) is None:
+                next_tensordict.set(key, tensordict.get(key))
         self.episode += ending(tensordict, next_tensordict)
         return next_tensordict
 
-    def _entries(self, observation_spec: Composite) -> dict[NestedKey, TensorSpec]:
+    def _entries(self, observation_spec: Composite) -> dict[str, TensorSpec]:
         if observation_spec.shape != self.episode.shape:
             raise ValueError(
                 f"DemonstrationSource was made for batch_size={tuple(self.episode.shape)}, but the "
                 f"environment has {tuple(observation_spec.shape)}"
             )
-        task_key, embedding_key, index_key = self.out_keys
         n_features = self._embedding.shape[-1]
         index = unbounded(observation_spec, dtype=torch.int64)
-        entries: dict[NestedKey, TensorSpec] = {
-            embedding_key: unbounded(observation_spec, n_features, dtype=self._embedding.dtype),
-            index_key: index,
+        entries: dict[str, TensorSpec] = {
+            "demo_embedding": unbounded(observation_spec, n_features, dtype=torch.float32),
+            "demo_index": index,
         }
-        if task_key not in observation_spec.keys(True, True):
-            entries[task_key] = index.clone()
+        if "task" not in observation_spec.keys(True, True):
+            entries["task"] = index.clone()
         return entries
 
 

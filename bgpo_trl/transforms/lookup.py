@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
@@ -33,38 +33,29 @@ class DemonstrationLookup(EpisodeTransform):
         learn: Adapt the network. May be changed at any time; independent of ``train()`` and
             ``eval()``, which TorchRL calls on all transforms. Set it to False for
             ``check_env_specs`` if episodes can end within the three steps of the check.
-        in_keys: Key of the demonstration's embedding.
-        out_keys: Entries written.
 
     Raises:
         ValueError: If the demonstration's embedding is missing, or the network is to learn from an
             environment of another batch size.
     """
 
-    written: ClassVar[Sequence[str]]
+    reads = ("demo_embedding",)
 
-    def __init__(
-        self,
-        network: Any,
-        *,
-        learn: bool,
-        in_keys: Sequence[NestedKey] = ("demo_embedding",),
-        out_keys: Sequence[NestedKey] | None = None,
-    ) -> None:
-        super().__init__(in_keys, self.written if out_keys is None else out_keys)
+    def __init__(self, network: Any, *, learn: bool) -> None:
+        super().__init__()
         self.network = network
         self.learn = learn
 
     def look_up(self, embedding: Tensor) -> tuple[Tensor, ...]:
-        """Return the ``out_keys`` for embeddings ``[*B, d]``."""
+        """Return the entries to write for embeddings ``[*B, d]``."""
         raise NotImplementedError
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Look up the demonstrations of any TensorDict, without learning."""
-        embedding = tensordict.get(self.in_keys[0], None)
+        embedding = tensordict.get("demo_embedding", None)
         if embedding is None:
-            raise missing_key(type(self).__name__, tensordict, self.in_keys[:1])
-        for key, value in zip(self.out_keys, self.look_up(embedding), strict=True):
+            raise missing_key(type(self).__name__, tensordict, ["demo_embedding"])
+        for key, value in zip(self.writes, self.look_up(embedding), strict=True):
             # The network may compute in another dtype than the one that the spec announces.
             tensordict.set(key, value.to(embedding.dtype) if value.is_floating_point() else value)
         return tensordict
@@ -75,7 +66,7 @@ class DemonstrationLookup(EpisodeTransform):
         return self.forward(tensordict_reset)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        for key in self.out_keys:
+        for key in self.writes:
             next_tensordict.set(key, tensordict.get(key))
         if self.learn:
             ended = ending(tensordict, next_tensordict)
@@ -87,7 +78,7 @@ class DemonstrationLookup(EpisodeTransform):
         self, tensordict: TensorDictBase, next_tensordict: TensorDictBase, ended: Tensor
     ) -> None:
         """Learn from the episodes of the rows that ``ended``, bool ``[*B]``."""
-        self.network.adapt(tensordict.get(self.in_keys[0]), mask=ended)
+        self.network.adapt(tensordict.get("demo_embedding"), mask=ended)
 
     def _fits(self, batch_size: torch.Size) -> bool:
         """Return whether there is a network for each row of an environment."""
@@ -95,7 +86,7 @@ class DemonstrationLookup(EpisodeTransform):
 
     def _demonstration_spec(self, observation_spec: Composite) -> TensorSpec:
         """Return the spec of the demonstration's embedding, after checking the batch size."""
-        demonstration = self._read_spec(observation_spec, self.in_keys[0], "DemonstrationSource")
+        demonstration = self._read_spec(observation_spec, "demo_embedding", "DemonstrationSource")
         if self.learn and not self._fits(observation_spec.shape):
             raise ValueError(
                 f"{type(self).__name__} is to learn from an environment of batch_size="
@@ -134,7 +125,7 @@ class BehaviorLookup(DemonstrationLookup):
         (torch.Size([50, 32]), 1)
     """
 
-    written = ("behavior", "behavior_node")
+    writes = ("behavior", "behavior_node")
 
     def seed_rows(self, seeds: Sequence[int]) -> None:
         """Draw the random nodes of GWR-B anew, in the networks that learn and have not begun to."""
@@ -146,11 +137,10 @@ class BehaviorLookup(DemonstrationLookup):
         match = self.network.lookup(embedding)
         return match.embedding, match.node
 
-    def _entries(self, observation_spec: Composite) -> dict[NestedKey, TensorSpec]:
-        behavior_key, node_key = self.out_keys
+    def _entries(self, observation_spec: Composite) -> dict[str, TensorSpec]:
         return {
-            behavior_key: self._demonstration_spec(observation_spec).clone(),
-            node_key: unbounded(observation_spec, dtype=torch.int64),
+            "behavior": self._demonstration_spec(observation_spec).clone(),
+            "behavior_node": unbounded(observation_spec, dtype=torch.int64),
         }
 
 
@@ -172,9 +162,6 @@ class GroupLookup(DemonstrationLookup):
         network: Groups of each row.
         learn: As for `DemonstrationLookup`.
         starts: First latent of each demonstration by its index, float32 ``[N, 64]``.
-        in_keys: Keys of embedding, latent, index and success; the last three are read with
-            ``starts``.
-        out_keys: Entries written.
 
     Raises:
         ValueError: As from `DemonstrationLookup`.
@@ -192,7 +179,8 @@ class GroupLookup(DemonstrationLookup):
         tensor([0])
     """
 
-    written = ("group", "group_novelty", "group_fits", "expert")
+    reads = ("demo_embedding", "latent", "demo_index", "success")
+    writes = ("group", "group_novelty", "group_fits", "expert")
     network: Sequence[BehaviorGroups]
 
     def __init__(
@@ -201,14 +189,12 @@ class GroupLookup(DemonstrationLookup):
         *,
         learn: bool,
         starts: Tensor | None = None,
-        in_keys: Sequence[NestedKey] = ("demo_embedding", "latent", "demo_index", "success"),
-        out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
-        super().__init__(network, learn=learn, in_keys=in_keys, out_keys=out_keys)
+        super().__init__(network, learn=learn)
         self.starts = starts
 
     def look_up(self, embedding: Tensor) -> tuple[Tensor, ...]:
-        """Return the ``out_keys`` for embeddings ``[*B, 32]``; the expert is that of the group."""
+        """Return the entries for embeddings ``[*B, 32]``; the expert is that of the group."""
         pairs = zip(self.network, self._of_rows(embedding), strict=True)
         matches, shape = [groups.lookup(phi) for groups, phi in pairs], embedding.shape[:-1]
         group = torch.stack([match.group for match in matches]).view(shape)
@@ -220,7 +206,7 @@ class GroupLookup(DemonstrationLookup):
     ) -> TensorDictBase:
         self.forward(tensordict_reset)
         if self.learn and self.starts is not None:
-            latent = self._of_rows(tensordict_reset.get(self.in_keys[1]))[:, 0]
+            latent = self._of_rows(tensordict_reset.get("latent"))[:, 0]
             group, _, fits, expert = self._written(tensordict_reset)
             for row in starting(tensordict).flatten().nonzero().flatten().tolist():
                 expert[row], fits[row] = self.network[row].expert(latent[row], int(group[row]))
@@ -229,28 +215,28 @@ class GroupLookup(DemonstrationLookup):
     def _learn(
         self, tensordict: TensorDictBase, next_tensordict: TensorDictBase, ended: Tensor
     ) -> None:
-        phi = self._of_rows(tensordict.get(self.in_keys[0]))[:, 0]
+        phi = self._of_rows(tensordict.get("demo_embedding"))[:, 0]
         group, _, fits, expert = self._written(tensordict)
         for row in ended.flatten().nonzero().flatten().tolist():
             groups = self.network[row]
             if self.starts is None:
                 groups.adapt(phi[row])
                 continue
-            index = int(tensordict.get(self.in_keys[2]).flatten()[row])
-            success = bool(next_tensordict.get(self.in_keys[3]).flatten()[row])
+            index = int(tensordict.get("demo_index").flatten()[row])
+            success = bool(next_tensordict.get("success").flatten()[row])
             groups.adapt(phi[row], self.starts[index])
             groups.end(int(group[row]), int(expert[row]), fits=bool(fits[row]), success=success)
 
     def _written(self, tensordict: TensorDictBase) -> list[Tensor]:
         """Return views of the entries written, by row ``[S]``."""
-        return [tensordict.get(key).view(-1) for key in self.out_keys]
+        return [tensordict.get(key).view(-1) for key in self.writes]
 
-    def _entries(self, observation_spec: Composite) -> dict[NestedKey, TensorSpec]:
+    def _entries(self, observation_spec: Composite) -> dict[str, TensorSpec]:
         demonstration = self._demonstration_spec(observation_spec)
         dtypes = (torch.int64, demonstration.dtype, torch.bool, torch.int64)
         return {
             key: unbounded(observation_spec, dtype=dtype)
-            for key, dtype in zip(self.out_keys, dtypes, strict=True)
+            for key, dtype in zip(self.writes, dtypes, strict=True)
         }
 
     def _fits(self, batch_size: torch.Size) -> bool:

@@ -195,7 +195,7 @@ def test_outside_an_environment_it_only_looks_up():
 def test_bad_batch_sizes_and_missing_entries_are_refused():
     env, _ = make_groups([4, 2])
     other = [BehaviorGroups(32) for _ in range(3)]
-    env.append_transform(GroupLookup(other, learn=True, out_keys=("other", "novelty")))
+    env.append_transform(GroupLookup(other, learn=True))
     with pytest.raises(ValueError, match="batch_size"):
         env.reset()
     lookup = GroupLookup([BehaviorGroups(32)], learn=True)
