@@ -16,7 +16,6 @@ from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.configs import PRESETS, RLConfig
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.experiments.command_line import command_line
-from bgpo_trl.experiments.settings import chosen
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import plot_success_curves
 from bgpo_trl.machine import choose_device, set_threads
@@ -70,7 +69,7 @@ def privileged_information(arguments: InformationArguments) -> str:
         ValueError: If an input is unknown or repeated, or a directory holds another run.
     """
     names = arguments.inputs
-    if not names or len(set(names)) < len(names):
+    if not names or len(set(names)) < len(names) or not {*names} <= {*INPUTS}:
         raise ValueError(f"--inputs: name some of {', '.join(INPUTS)}, each once")
     set_threads(arguments.threads)
     device = choose_device(arguments.device)
@@ -83,9 +82,9 @@ def privileged_information(arguments: InformationArguments) -> str:
         eval_every=max(1, min(100, arguments.episodes)),
         eval_episodes=5,
     )
-    chosen_inputs = {name: chosen(INPUTS, name, "--inputs") for name in names}
     table: Table = [["policy observes", *base.tasks, "all"]]
-    for name, (algorithm, changes) in chosen_inputs.items():
+    for name in names:
+        algorithm, changes = INPUTS[name]
         settings: Any = {**changes, "rl": arguments.rl}
         config = replace(ALGORITHMS[algorithm].config, **settings)
         out = arguments.out / name

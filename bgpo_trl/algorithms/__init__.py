@@ -113,5 +113,8 @@ each addition of this package to the published algorithm, and all of them togeth
 def entry(name: str) -> Entry:
     """Return the entry of an algorithm; raise ``ValueError`` if the name is unknown."""
     if name not in ALGORITHMS:
-        raise ValueError(f"no algorithm {name!r}: choose one of {', '.join(ALGORITHMS)}")
+        raise ValueError(
+            f"no algorithm {name!r}: choose one of {', '.join(ALGORITHMS)}, or name the module "
+            "that adds it with --import"
+        )
     return ALGORITHMS[name]

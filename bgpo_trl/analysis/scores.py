@@ -19,8 +19,11 @@ from bgpo_trl.runs.results import Run
 Values = NDArray[np.float64]
 
 
-def _mean(values: Values, axis: int) -> Values:
-    """Return the mean of the values that are not NaN; NaN where all are."""
+def known_mean(values: Values, axis: int = 0) -> Values:
+    """Return the mean of the values that are not NaN along an axis, by default seeds.
+
+    NaN where all are.
+    """
     return np.ma.filled(np.ma.masked_invalid(values).mean(axis), np.nan)
 
 
@@ -52,7 +55,7 @@ def evaluation_matrix(run: Run, ends: Sequence[int], window: int) -> Values:
                 f"there is no evaluation in the {window} episodes before episode {end}: test "
                 "more often, or for a longer run"
             )
-        phases.append(_mean(run.success[:, chosen], axis=1))
+        phases.append(known_mean(run.success[:, chosen], axis=1))
     return np.stack(phases, axis=1)
 
 

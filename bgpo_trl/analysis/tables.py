@@ -21,6 +21,7 @@ from bgpo_trl.analysis.scores import (
     final_means,
     forgetting,
     forward_transfer,
+    known_mean,
     late_scores,
     own_episodes,
     success_matrix,
@@ -85,16 +86,11 @@ def success_section(setting: Setting) -> list[Section]:
         row = [name, _knows(run), str(len(late)), statistics.mean(late.mean(1)).percent()]
         row += [f"{statistics.mean(late[:, worst]).percent()}, task {worst + 1}"]
         row += [f"{100 * share:.1f}" for share in late.mean(0)]
-        steps, demonstrated = _task_means(success_steps(run)), demonstrated_steps(run)
+        steps, demonstrated = known_mean(success_steps(run)), demonstrated_steps(run)
         solved = ~np.isnan(steps)
         row += [_mean_cell(steps[solved]), _mean_cell(demonstrated[solved])]
         rows.append([*row, statistics.mean(area.mean(1)).percent()])
     return [Section(setting.title, rows, notes=notes)]
-
-
-def _task_means(steps: Values) -> Values:
-    """Return the means over seeds of steps ``[S, T]``; NaN for tasks that no seed solves."""
-    return np.ma.masked_invalid(steps).mean(0).filled(np.nan)
 
 
 def _mean_cell(steps: Values) -> str:
@@ -237,7 +233,7 @@ def run_section(title: str, run: Run) -> Section:
     inferred = final_means(run, "held-out", "task_inference")
     trained = final_means(run, "held-out", "steps")
     steps = [
-        *(None if found is None else _task_means(found) for found in (success_steps(run), trained)),
+        *(None if found is None else known_mean(found) for found in (success_steps(run), trained)),
         demonstrated_steps(run),
     ]
     rows = [["task", "last 10 %", "by seed", "trained, seen", "trained, held-out", "inferred"]]

@@ -16,7 +16,6 @@ from bgpo_trl.configs.encoders import (
     InverseModelConfig,
     RepresentationConfig,
     SequenceAutoencoderConfig,
-    StageConfig,
     VAEConfig,
 )
 from bgpo_trl.configs.runs import PRESETS, RunConfig
@@ -37,6 +36,5 @@ __all__ = [
     "RepresentationConfig",
     "RunConfig",
     "SequenceAutoencoderConfig",
-    "StageConfig",
     "VAEConfig",
 ]

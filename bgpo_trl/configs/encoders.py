@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from bgpo_trl.configs.algorithms import at_least, check, positive
 from bgpo_trl.configs.settings import Settings
@@ -130,27 +131,16 @@ class RepresentationConfig(Settings):
         at_least(self, 1, "checkpoint_every", "log_every")
 
 
-@dataclass(frozen=True)
-class StageConfig:
-    """Stage 1 of a preset that trains its own encoders."""
-
-    per_task: int
-    """Demonstrations of each task."""
-    held_out_per_task: int
-    """Held-out demonstrations among them."""
-    config: RepresentationConfig
-    """Training of the encoders."""
-
-
-STAGE_PRESETS: dict[str, StageConfig] = {
-    "smoke": StageConfig(
-        per_task=12,
-        held_out_per_task=4,
-        config=RepresentationConfig(
+STAGE_PRESETS: dict[str, dict[str, Any]] = {
+    "smoke": {
+        "per_task": 12,
+        "held_out_per_task": 4,
+        "config": RepresentationConfig(
             vae=VAEConfig(steps=20, batch_size=64),
             lae=SequenceAutoencoderConfig(steps=50, batch_size=32),
             inverse=InverseModelConfig(steps=50, batch_size=32),
         ),
-    )
+    }
 }
-"""Presets that run every stage instead of using the shipped encoders."""
+"""Presets that run every stage instead of using the shipped encoders, and the arguments with which
+`make_pretrained` records demonstrations and trains encoders."""

@@ -22,7 +22,6 @@ from bgpo_trl.experiments.arguments import Arguments, BankArguments
 from bgpo_trl.experiments.measure import draw, measure
 from bgpo_trl.experiments.settings import (
     changed_hyperparameters,
-    chosen_scene,
     chosen_tasks,
     named_directory,
     run_config,
@@ -181,14 +180,14 @@ def _inputs(
         return load_inputs(out, config.tasks, begun[1], scene)
     # A bank fits only the encoders that embedded it.
     given = arguments.encoders is not None or bank is not None
-    if not (arguments.train_encoders or (arguments.preset in STAGE_PRESETS and not given)):
+    stage = STAGE_PRESETS.get(arguments.preset or "", {})
+    if not arguments.train_encoders and (given or not stage):
         if arguments.resume and not holds_run(out) and (out / _DATASET).exists():
             raise ValueError(
                 f"{out} holds the beginning of new encoders: add --train-encoders, or name another "
                 "directory"
             )
         return pretrained_for(config.tasks, bank, scene=scene, weights=arguments.encoders)
-    stage = STAGE_PRESETS.get(arguments.preset or "")
     encoders, made = make_pretrained(
         own_weights(out),
         out / _DATASET,
@@ -198,7 +197,7 @@ def _inputs(
         tasks=config.tasks,
         spread=config.spread,
         scene=scene,
-        **({} if stage is None else vars(stage)),
+        **stage,
     )
     return encoders, made.for_tasks(config.tasks)
 
@@ -236,6 +235,6 @@ def pretrained_for(
 
 def bank_of(arguments: BankArguments) -> DemonstrationBank:
     """Load the demonstrations that a command line names, embedded by trained encoders."""
-    scene = chosen_scene(arguments.scene)
+    scene = find_scene(arguments.scene or "nico")
     tasks = chosen_tasks(arguments.tasks, scene)
     return pretrained_for(tasks, arguments.bank, scene=scene, weights=arguments.encoders)[1]

@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import tyro
 
-from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms import ALGORITHMS, entry
 from bgpo_trl.configs import PRESETS, RunConfig
 from bgpo_trl.configs.runs import check_seeds
 from bgpo_trl.experiments.arguments import SETTINGS, Arguments
 from bgpo_trl.runs.config_file import read_config, read_settings
 from bgpo_trl.runs.directory import differing_settings
 from bgpo_trl.scenes import Scene, find_scene
-
-_Entry = TypeVar("_Entry")
 
 
 def run_config(
@@ -28,12 +26,14 @@ def run_config(
     Raises:
         ValueError: If the settings are invalid, or a file, task or algorithm does not exist.
     """
-    config = _with_algorithm(_begin(arguments), arguments)
-    scene = chosen_scene(arguments.scene, config.scene)
+    config, name = _begin(arguments), arguments.algorithm
+    if name is not None:
+        config = replace(config, name=name, algorithm=entry(name).config)
+    scene = find_scene(arguments.scene or config.scene)
     if scene.name != config.scene:
         config = _in_scene(config, scene)
     if arguments.tasks is not None:
-        config = _with_tasks(config, chosen_tasks(arguments.tasks, scene, config.tasks))
+        config = _with_tasks(config, chosen_tasks(arguments.tasks, scene))
     if arguments.episodes is not None:
         config = _with_episodes(config, arguments.episodes)
     given = {name: value for name, value in (changes or {}).items() if value is not None}
@@ -87,13 +87,6 @@ def named_directory(arguments: Arguments) -> Path | None:
     return arguments.out
 
 
-def _with_algorithm(config: RunConfig, arguments: Arguments) -> RunConfig:
-    if arguments.algorithm is None:
-        return config
-    entry = chosen(ALGORITHMS, arguments.algorithm, "--algorithm")
-    return replace(config, name=arguments.algorithm, algorithm=entry.config)
-
-
 def _in_scene(config: RunConfig, scene: Scene) -> RunConfig:
     """Return a run of the usual tasks of another scene, with episodes of their length."""
     rl = config.algorithm.rl
@@ -115,34 +108,18 @@ def _with_episodes(config: RunConfig, episodes: int) -> RunConfig:
     return replace(config, episodes=episodes, task_starts=starts, eval_every=every)
 
 
-def chosen(entries: Mapping[str, _Entry], name: str, flag: str) -> _Entry:
-    """Return the entry that a flag names; raise ``ValueError`` if there is none."""
-    if name not in entries:
-        raise ValueError(
-            f"{flag}: there is no {name!r}; name one of {', '.join(entries)}, or with --import "
-            "MODULE one that a module adds"
-        )
-    return entries[name]
+def chosen_tasks(tasks: tuple[str, ...] | None, scene: Scene) -> tuple[str, ...]:
+    """Return the tasks of a scene that ``--tasks`` names, by default its usual ones.
 
-
-def chosen_scene(name: str | None, default: str = "nico") -> Scene:
-    """Return the scene that ``--scene`` names."""
-    return find_scene(default if name is None else name)
-
-
-def chosen_tasks(
-    tasks: tuple[str, ...] | None, scene: Scene, default: tuple[str, ...] | None = None
-) -> tuple[str, ...]:
-    """Return the tasks of a scene that ``--tasks`` names, by default its usual ones."""
+    Raises:
+        ValueError: If there are none, or as from `Scene.check_tasks`.
+    """
     if tasks is None:
-        return scene.default_tasks if default is None else default
-    if tasks == ("all",):
-        return scene.all_tasks
-    known = tuple(scene.tasks)
+        return scene.default_tasks
     if not tasks:
-        raise ValueError(f"--tasks: it is empty; name some of {', '.join(known)}")
-    for name in tasks:
-        chosen(dict.fromkeys(known), name, "--tasks")
+        raise ValueError(f"--tasks: name some of {', '.join(scene.tasks)}")
+    tasks = scene.all_tasks if tasks == ("all",) else tasks
+    scene.check_tasks(tasks)
     return tasks
 
 

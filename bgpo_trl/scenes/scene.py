@@ -376,7 +376,8 @@ class Scene:
             if name not in self.tasks:
                 raise ValueError(
                     f"the scene {self.name!r} has no task {name!r}: choose one of "
-                    f"{', '.join(self.tasks)}, or add it first (docs/extending.md)"
+                    f"{', '.join(self.tasks)}, or add it first (docs/extending.md), in a module of "
+                    "--import"
                 )
             if name in tasks[:position]:
                 raise ValueError(f"the task {name!r} is named twice: name each once")
