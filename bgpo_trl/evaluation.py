@@ -159,14 +159,12 @@ class Evaluator:
             policy=policy,
         )
 
-    def run_next(
-        self, device: torch.device | str = "cpu", watch: Callable[[], object] = lambda: None
-    ) -> TestResult | None:
-        """Run the next evaluation if all seeds have queued a snapshot; arguments as for `run`."""
+    def run_next(self, device: torch.device | str = "cpu") -> TestResult | None:
+        """Run the next evaluation if all seeds have queued a snapshot."""
         if not all(self._waiting):
             return None
         self._next += 1
-        return self.run([waiting.pop(0) for waiting in self._waiting], device, watch)
+        return self.run([waiting.pop(0) for waiting in self._waiting], device)
 
     @torch.no_grad()
     def run(

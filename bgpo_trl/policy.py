@@ -427,16 +427,8 @@ def load_run(
 def load_all_seeds(path: str | Path, *, make: Callable[..., Algorithm] | None = None) -> LoadedRun:
     """Load the algorithm of all seeds of a run, finished or not, from its last checkpoint.
 
-    Unlike `load_run`, it also takes runs on the ground truth, if encoders embedded their
-    demonstrations.
-
-    Args:
-        path: The run's directory, which is only read.
-        make: Constructor of the algorithm, as for `Trainer`, if it is not in `ALGORITHMS`.
-
-    Raises:
-        ValueError: If the run, its checkpoint, algorithm, tasks, encoders or demonstrations cannot
-            be found.
+    Arguments and errors are those of `load_run`, but runs on the ground truth are taken too, if
+    encoders embedded their demonstrations.
     """
     path = Path(path)
     config, digests = read_config(path / "config.json")

@@ -88,8 +88,8 @@ class Representation:
 
 
 @torch.no_grad()
-def encode_frames(network: FrameNetwork, dataset: TensorDictBase, batch_size: int = 64) -> Tensor:
-    """Encode the valid frames of demonstrations in batches.
+def encode_frames(network: FrameNetwork, dataset: TensorDictBase) -> Tensor:
+    """Encode the valid frames of demonstrations, 64 at a time.
 
     Reads ``pixels`` uint8 ``[N, T, H, W, 3]`` and ``length`` ``[N]``.
 
@@ -100,7 +100,7 @@ def encode_frames(network: FrameNetwork, dataset: TensorDictBase, batch_size: in
     latent = torch.zeros(*pixels.shape[:2], network.latent_size)
     device = network.latent_mean.device
     demonstration, time = valid_steps(length, pixels.shape[1]).nonzero(as_tuple=True)
-    for d, t in zip(demonstration.split(batch_size), time.split(batch_size), strict=True):
+    for d, t in zip(demonstration.split(64), time.split(64), strict=True):
         latent[d, t] = network.latent(pixels[d, t].to(device)).cpu()
     return latent
 

@@ -12,7 +12,6 @@ from shlex import quote
 import torch
 from torchrl.record.loggers.common import Logger
 
-from bgpo_trl.algorithms import Algorithm
 from bgpo_trl.configs import STAGE_PRESETS, RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import load_pretrained, weights_of_bank
@@ -51,12 +50,7 @@ def concurrent(arguments: Arguments) -> str:
     return run_experiment(arguments, "concurrent", run_config(arguments, from_start=True))
 
 
-def run_experiment(
-    arguments: Arguments,
-    name: str,
-    config: RunConfig,
-    make: Callable[..., Algorithm] | None = None,
-) -> str:
+def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
     """Train to the end, run the final tests and draw the figures.
 
     In addition to the files of `Trainer`, the run directory gets ``final.csv`` (success and steps
@@ -109,7 +103,6 @@ def run_experiment(
             out,
             bank=bank,
             encoders=encoders,
-            make=make,
             device=device,
             resume=arguments.resume,
             loggers=loggers,

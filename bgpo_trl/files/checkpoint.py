@@ -74,11 +74,10 @@ def save_checkpoint(directory: str | os.PathLike[str], state: dict[str, Any]) ->
 def load_checkpoint(
     directory: str | os.PathLike[str],
     *,
-    map_location: str | torch.device = "cpu",
     mmap: bool = False,
     newest: bool = False,
 ) -> dict[str, Any]:
-    """Read the newest intact checkpoint; warn about newer ones that are damaged.
+    """Read the newest intact checkpoint to the CPU; warn about newer ones that are damaged.
 
     With ``mmap``, tensors are mapped from the file lazily, for reading only some of them. With
     ``newest``, only the newest one is read, for what is to be used as it is, not resumed.
@@ -88,7 +87,7 @@ def load_checkpoint(
     """
     directory = Path(directory)
     for path in _checkpoints(directory):
-        state = _read(path, map_location, mmap)
+        state = _read(path, mmap)
         if state is not None:
             return state
         if newest:
@@ -103,13 +102,13 @@ def load_checkpoint(
     )
 
 
-def _read(path: Path, map_location: str | torch.device, mmap: bool) -> dict[str, Any] | None:
+def _read(path: Path, mmap: bool) -> dict[str, Any] | None:
     """Return the content of a checkpoint; None if it is damaged, or not one."""
     try:
         with zipfile.ZipFile(path) as file:
             if file.testzip() is not None:
                 return None
-        state = torch.load(path, map_location=map_location, weights_only=True, mmap=mmap)
+        state = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
     except Exception:  # Damage raises errors of many kinds.
         return None
     return state if isinstance(state, dict) else None

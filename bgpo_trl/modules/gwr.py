@@ -223,16 +223,15 @@ class GWRB(nn.Module):
         """Call `lookup`."""
         return self.lookup(phi)
 
-    def lookup(self, phi: Numbers, mask: Numbers | None = None) -> BehaviorMatch:
+    def lookup(self, phi: Numbers) -> BehaviorMatch:
         """Find the best match of each input (step 2), without learning.
 
         Args:
             phi: Numbers ``[*batch_size, *extra, d]``; each network matches all its ``extra``
                 inputs.
-            mask: Networks that take part, bool ``[*batch_size]``; None: all.
 
         Returns:
-            Matches ``[*batch_size, *extra]``; NaN and node -1 where ``mask`` is False.
+            Matches ``[*batch_size, *extra]``.
 
         Raises:
             ValueError: If phi has the wrong shape or holds NaN or Inf, or a network is still empty.
@@ -244,11 +243,11 @@ class GWRB(nn.Module):
                 f"phi must begin with dimensions {[*self.batch_size]} and end with "
                 f"{self.n_features}; got {[*phi.shape]}"
             )
-        network = self._taking_part(mask)
-        if not all(self._topologies[i].edges for i in network.tolist()):
+        network = self._taking_part(None)
+        if not all(topology.edges for topology in self._topologies):
             raise ValueError("an empty network matches nothing: adapt() it to an input first")
         phi = phi.reshape(n_networks, batch.numel() // n_networks, self.n_features)
-        phi = checked(self._part(phi, network), self._weights)
+        phi = checked(phi, self._weights)
         distance, row = self._distances(phi, network).min(-1)
         return self._match(network, row, self._activity(distance), batch)
 

@@ -347,14 +347,10 @@ class Scene:
         spread: float = 1.0,
         observation: Observation = "pixels",
     ) -> SimulationEnv:
-        """Return the simulations of some tasks as an environment, see `SimulationEnv`.
+        """Return the simulations of some tasks as an environment.
 
-        Args:
-            tasks: Names of the tasks, in the order of their numbers.
-            batch_size: Shape of the batch.
-            seed: As for `SimulationEnv`.
-            spread: Share of the whole range of start states, from 0 to 1.
-            observation: ``"pixels"``, ``"state"`` or ``"both"``.
+        Arguments are those of `SimulationEnv`; ``spread`` is the share of the whole range of start
+        states, from 0 to 1.
 
         Raises:
             ValueError: If a task is unknown, or ground truth or spread are asked of a scene that
