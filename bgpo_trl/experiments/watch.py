@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
@@ -18,7 +19,6 @@ from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.writing import check_folder
 from bgpo_trl.policy import Recognition, TrainedPolicy, load_run
 from bgpo_trl.scenes import Scene, Simulation, find_scene
-from bgpo_trl.scenes.scene import checked_frame, checked_numbers, checked_step
 
 _HEIGHT = 128  # (pixels) of each picture
 _BORDER, _CAPTION, _GAP = 4, 18, 8
@@ -73,25 +73,22 @@ def demonstrate(
 def play(policy: TrainedPolicy, task: str, demonstration: NDArray, seed: int) -> Episode:
     """Show the policy a demonstration, and return its episode from the start with that seed."""
     policy.condition(demonstration, task=task)
-    config = policy.config
+    config, reads_joints = policy.config, policy.algorithm.joints is not None
     scene = find_scene(config.scene)
-    env, shape = scene.simulate([task], batch_size=1, spread=config.spread), scene.frame_shape
-    simulation = env.simulations[0]
-    simulation.seed(seed)
-    simulation.reset(task)
-    seen, views, success = [checked_frame(simulation, shape)], [_view(simulation)], False
-    columns = policy.algorithm.joints
+    env = scene.simulate([task], batch_size=1, seed=seed, spread=config.spread)
+    state, seen, views = env.reset(), [env.frames()[0]], [_view(env.simulations[0])]
     for _ in range(config.algorithm.max_steps):
-        joints = columns and checked_numbers(simulation, "joints", columns.size)
-        action = policy.act(seen[-1], joints).astype(np.float64)
-        success, failure, _ = checked_step(simulation, action)
-        seen.append(checked_frame(simulation, shape))
-        views.append(_view(simulation))
-        if success or failure:
+        joints = state["joints"][0].numpy() if reads_joints else None
+        action = torch.from_numpy(policy.act(seen[-1], joints))
+        state = env.step(state.set("action", action.unsqueeze(0)))["next"]
+        seen.append(env.frames()[0])
+        views.append(_view(env.simulations[0]))
+        if state["done"].any():
             break
     env.close()
     there = [view for view in views if view is not None]
-    return Episode(task, demonstration, np.stack(seen), np.stack(there) if there else None, success)
+    view, success = np.stack(there) if there else None, bool(state["success"].any())
+    return Episode(task, demonstration, np.stack(seen), view, success)
 
 
 def _view(simulation: Simulation) -> NDArray | None:

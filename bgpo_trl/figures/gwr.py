@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
+from bgpo_trl.algorithms import Algorithm
+from bgpo_trl.analysis.task_inference import majority_task, match_counts
+from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.figures.style import MARKERS, add_legend, save_figure, style_axes, task_markers
-
-if TYPE_CHECKING:
-    from bgpo_trl.algorithms import Algorithm
-    from bgpo_trl.data.bank import DemonstrationBank
 
 _NO_TASK = (-1, "no demonstration", "0.6", "x")
 # Paul Tol's muted colors, for groups, so that they are not taken for tasks.
@@ -105,8 +103,6 @@ def draw_nodes(
         bank: Demonstrations that define the nodes' majority tasks.
         tasks: Names of the tasks.
     """
-    from bgpo_trl.analysis.task_inference import majority_task, match_counts
-
     assert algorithm.gwr is not None
     weights, groups = algorithm.gwr.graph(0).weights, None
     node_tasks = majority_task(match_counts(algorithm.gwr, bank.seen(), len(tasks))[0])
