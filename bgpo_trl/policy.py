@@ -27,7 +27,6 @@ from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.dataset import resize_frames
 from bgpo_trl.encoders.representation import Representation, embed_demonstrations
-from bgpo_trl.files.checkpoint import has_checkpoint
 from bgpo_trl.files.writing import make_folder, write_whole
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.demonstrations import load_inputs
@@ -437,16 +436,7 @@ def load_all_seeds(path: str | Path, *, make: Callable[..., Algorithm] | None = 
             f"{path} was trained without encoders, of which its demonstrations are unknown: give "
             "its Trainer encoders"
         )
-    if make is None:
-        try:
-            make = entry(config.name).make
-        except ValueError:
-            raise ValueError(
-                f"{path} is a run of {config.name!r}, which is not in ALGORITHMS: name the "
-                "module that adds it with --import, or give make= as for its Trainer"
-            ) from None
-    if not has_checkpoint(path / "checkpoint"):
-        raise ValueError(f"{path} has no checkpoint: let the run reach its first one, or keep it")
+    make = entry(config.name).make if make is None else make
     encoders, bank = load_inputs(path, config.tasks, digests, config.scene)
     # Compared before anything is made of the sizes in the settings, which may not be the run's.
     saved = read_checkpoint(path, read_json(path / "config.json"), mmap=True, newest=True)

@@ -296,7 +296,7 @@ def cut_checkpoints(run):
     ("damage", "cause"),
     [
         (shutil.rmtree, "holds no run"),
-        (lambda run: shutil.rmtree(run / "checkpoint"), "no checkpoint"),
+        (lambda run: shutil.rmtree(run / "checkpoint"), "no intact checkpoint"),
         (cut_checkpoints, "is damaged"),
         (lambda run: shutil.rmtree(run / "encoders"), "trained with the encoders"),
         (lambda run: rewrite(run, encoders="0" * 64), "trained with the encoders 000000000000"),

@@ -97,8 +97,8 @@ def load_checkpoint(
             )
         warnings.warn(f"{path} is damaged: resuming from the checkpoint before it.", stacklevel=2)
     raise ValueError(
-        f"{directory} holds no intact checkpoint to resume from: put it back as the run left it, "
-        "or start a new run in another directory"
+        f"{directory} holds no intact checkpoint: let the run reach its first one, put it back as "
+        "the run left it, or start a new run in another directory"
     )
 
 

@@ -12,7 +12,6 @@ from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.representation import Representation
-from bgpo_trl.files.checkpoint import has_checkpoint
 from bgpo_trl.runs.config_file import read_config, settings_of
 from bgpo_trl.runs.demonstrations import load_inputs, weights_of_run
 from bgpo_trl.runs.directory import read_checkpoint
@@ -61,8 +60,6 @@ def add_task(
     if task in saved.tasks:
         raise ValueError(f"{directory} has the task {task!r} already: resume it without adding one")
     scene.check_tasks((task,))
-    if not has_checkpoint(directory / "checkpoint"):
-        raise ValueError(f"{directory} has no checkpoint: begin a new run with all of the tasks")
     encoders, shown = load_inputs(directory, saved.tasks, digests, scene)
     weights = weights_of_run(directory, scene, encoders.identity)
     assert weights is not None  # `load_inputs` has found them.
