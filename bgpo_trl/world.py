@@ -13,8 +13,6 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.seeding import generators, stream_seed
 from bgpo_trl.transforms import DemonstrationSource, TaskSchedule
 
-__all__ = ["World"]
-
 
 class World:
     """Simulations of a batch of seeds, within the transforms of an algorithm.

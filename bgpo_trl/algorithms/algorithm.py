@@ -28,8 +28,6 @@ from bgpo_trl.scenes import Scene, StateColumns, find_scene
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import DemonstrationSource
 
-__all__ = ["Algorithm", "Policy", "read_joints"]
-
 
 def read_joints(config: AlgorithmConfig, scene: Scene) -> StateColumns | None:
     """Return the scale of the joints if policies read them, else None.

@@ -36,8 +36,6 @@ from bgpo_trl.transforms import (
     GroupLookup,
 )
 
-__all__ = ["conditioning_on", "observation_env", "training_env"]
-
 
 def training_env(
     config: AlgorithmConfig,

@@ -15,8 +15,6 @@ from bgpo_trl.algorithms.rl import Learner, LearnerSpec
 from bgpo_trl.configs import EWCConfig, FineTuningConfig
 from bgpo_trl.seeding import generators
 
-__all__ = ["EWC", "EWCLearner", "FineTuning", "diagonal_fisher"]
-
 
 class FineTuning(BGPO):
     """One policy that goes on learning where a task begins, from an empty replay.

@@ -11,8 +11,6 @@ from torch import Tensor
 
 from bgpo_trl.algorithms.rl import Expert, Learner
 
-__all__ = ["ActiveGroups", "Experts"]
-
 
 class ActiveGroups:
     """Groups that each seed ``S`` has played lately.

@@ -14,8 +14,6 @@ from bgpo_trl.configs import DistNLLConfig, MAMLConfig
 from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.seeding import generators
 
-__all__ = ["TaskAlgorithm"]
-
 
 class TaskAlgorithm(Algorithm):
     """Algorithm with one policy per task, stacked ``[S, T]``, which plays its training episodes.

@@ -12,8 +12,6 @@ from torch import Tensor
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.replay import GroupReplay, draw_for_rows
 
-__all__ = ["DemonstrationReplay"]
-
 
 class DemonstrationReplay:
     """Transitions of the demonstrations shown to each seed, sampled by group.

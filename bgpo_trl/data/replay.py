@@ -14,8 +14,6 @@ from torch import Tensor
 
 from bgpo_trl.errors import missing_key
 
-__all__ = ["GroupReplay", "draw_for_rows"]
-
 _GROUP = "_group"  # entry of a saved state
 
 

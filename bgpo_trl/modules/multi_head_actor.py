@@ -14,8 +14,6 @@ from bgpo_trl.configs import RLConfig
 from bgpo_trl.modules.actor_critic import StackedNetwork
 from bgpo_trl.modules.stacked_mlp import StackedLinear, StackedMLP
 
-__all__ = ["MultiHeadActor"]
-
 _MIN_SCALE, _MAX_SCALE = 0.1, 1.0
 
 

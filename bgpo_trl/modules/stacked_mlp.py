@@ -15,8 +15,6 @@ from bgpo_trl.configs import RLConfig
 from bgpo_trl.errors import as_shape
 from bgpo_trl.seeding import one_each
 
-__all__ = ["StackedLinear", "StackedMLP"]
-
 
 class StackedLinear(nn.Module):
     """Linear layer with one weight matrix per seed, all of them applied in one call.

@@ -14,8 +14,6 @@ from torch.func import functional_call, grad
 from bgpo_trl.configs import MAMLConfig
 from bgpo_trl.objectives.ddpg import DDPGLoss
 
-__all__ = ["MAMLLoss"]
-
 Parameters = dict[str, Tensor]
 
 

@@ -15,13 +15,6 @@ from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 
-__all__ = [
-    "action_inference_loss",
-    "distillation_loss",
-    "sequence_reconstruction_loss",
-    "vae_inverse_loss",
-]
-
 
 def _entries(reader: str, batch: TensorDictBase, keys: Sequence[NestedKey]) -> list[Tensor]:
     """Return some entries of a batch; raise ``ValueError`` if one is missing."""

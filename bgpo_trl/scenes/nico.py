@@ -23,8 +23,6 @@ from suites.nico.base import STATE_CENTER, STATE_SCALE, Environment
 from suites.nico.demonstrator import Demonstrator
 from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer
 
-__all__ = ["NICO", "NicoEnv", "NicoSimulation"]
-
 _ROOM = (180, 70, 600, 350)  # (pixels) crop of the 640x480 room view to NICO and the table
 
 

@@ -17,19 +17,6 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from bgpo_trl.scenes.simulation import SimulationEnv
 
-__all__ = [
-    "SCENES",
-    "Observation",
-    "Outcome",
-    "Scene",
-    "Simulation",
-    "StateColumns",
-    "checked_frame",
-    "checked_numbers",
-    "checked_step",
-    "find_scene",
-]
-
 Observation = Literal["pixels", "state", "both"]
 
 

@@ -15,8 +15,6 @@ from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms._episode import EpisodeTransform, ending, starting, unbounded
 
-__all__ = ["BehaviorLookup", "DemonstrationLookup", "GroupLookup"]
-
 
 class DemonstrationLookup(EpisodeTransform):
     """Base of the transforms that look up a demonstration in a network that learns from it.
