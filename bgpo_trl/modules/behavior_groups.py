@@ -21,7 +21,7 @@ _KNOWN_SHARE = 0.99  # of a group's own demonstrations that are to count as know
 _FITTING_SHARE = 0.9  # of a group's own demonstrations whose starts are to count as fitting
 _ROUNDING = 1e-4  # of a vector's length; shipped demonstrations differ by 600 times as much
 _ARRAYS = ("points", "starts", "shown", "group", "member", "cluster")  # of the state
-_LISTS = ("parent", "links")
+_LISTS = ("parent", "links", "joined")
 
 
 class GroupMatch(TensorClass["tensor_only"]):
@@ -66,7 +66,9 @@ class BehaviorGroups:
        that of the group played most. A cluster that is left over becomes a new group, whose parent
        is the group with which it has most in common.
     4. Groups that turn out to be one behavior can be joined (`join`), and stay so: the clusters of
-       their densest demonstrations are one group from then on.
+       their densest demonstrations are one group from then on. If such a group splits, a cluster
+       more than half of whose demonstrations were in the group when it was joined still belongs
+       to it.
 
     A task that looks different from different starts, such as a push to the left or to the right,
     forms several groups. The expert of each does not know what to do where the group's own
@@ -101,6 +103,7 @@ class BehaviorGroups:
             outliers.
         parent: Parent of each group, by number; that of group 0 is 0.
         links: Pairs of demonstrations whose clusters are one group.
+        joined: For each time that two groups were joined, the demonstrations in their clusters.
         revision: How often earlier demonstrations have changed their groups.
 
     Examples:
@@ -121,6 +124,7 @@ class BehaviorGroups:
     cluster: NDArray[np.int64]
     parent: list[int]
     links: list[tuple[int, int]]
+    joined: list[list[int]]
     revision: int
 
     def __init__(
@@ -138,7 +142,7 @@ class BehaviorGroups:
         self.points, self.starts = np.empty((0, self.n_features)), np.empty((0, 0), np.float32)
         self.member = np.empty(0, np.bool_)
         self.shown, self.group, self.cluster = (np.empty(0, np.int64) for _ in range(3))
-        self.parent, self.links, self.revision = [0], [], 0
+        self.parent, self.links, self.joined, self.revision = [0], [], [], 0
         # Linear map [d, d] after which distances are measured.
         self._metric = np.eye(self.n_features)
         # By group, the 99 % quantile of its members' distances to their k-th neighbor in it.
@@ -159,7 +163,9 @@ class BehaviorGroups:
             raise ValueError(
                 f"groups to join must be two of {self.numbers}, got {first} and {second}"
             )
-        self.links.append((self._densest(first), self._densest(second)))
+        rows = [np.flatnonzero(self.member & (self.group == group)) for group in (first, second)]
+        self.links.append((self._densest(rows[0]), self._densest(rows[1])))
+        self.joined.append(np.concatenate(rows).tolist())
         self._arrange()
 
     def lookup(self, phi: Numbers) -> GroupMatch:
@@ -268,7 +274,8 @@ class BehaviorGroups:
         if len(sizes) > 1 or not {*arrays["group"].tolist()} <= {*range(len(state["parent"]))}:
             raise ValueError("a group is missing in the state: load one that state_dict returned")
         vars(self).update(arrays)
-        self.parent, self.links = [*state["parent"]], [*state["links"]]
+        for name in _LISTS:
+            setattr(self, name, [*state[name]])
         self.revision = state["revision"]
         self.trials.load_state_dict(state["trials"])
         self._fit_metric(len(self.cluster))
@@ -323,9 +330,8 @@ class BehaviorGroups:
         self.shown[same] += 1
         return is_new
 
-    def _densest(self, group: int) -> int:
-        """Return the demonstration of a group whose k-th neighbor in it is the nearest."""
-        rows = np.flatnonzero(self.member & (self.group == group))
+    def _densest(self, rows: NDArray[np.int64]) -> int:
+        """Return which of some demonstrations has the nearest k-th neighbor among them."""
         return int(rows[self._kth_distances(rows).argmin()])
 
     def _kth_distances(self, rows: NDArray[np.int64]) -> NDArray[np.floating]:
@@ -336,6 +342,7 @@ class BehaviorGroups:
     def _arrange(self) -> None:
         """Turn the clusters into groups, matched with the groups so far."""
         before = self.group
+        self._link_fragments()
         labels = np.full(len(self.points), -1)
         labels[: len(self.cluster)] = self._linked()
         common = np.zeros((labels.max() + 1, len(self.parent)), np.int64)
@@ -366,6 +373,19 @@ class BehaviorGroups:
             one, other = labels[inside[nearest]]
             labels[labels == other] = one
         return labels
+
+    def _link_fragments(self) -> None:
+        """Link the clusters into which joined groups have split."""
+        for rows in self.joined:
+            labels = self._linked()
+            found, counts = np.unique(labels[rows][labels[rows] >= 0], return_counts=True)
+            parts = [
+                np.flatnonzero(labels == label)
+                for label in found[np.argsort(-counts, kind="stable")]
+            ]
+            for part in parts[1:]:
+                if 2 * np.isin(part, rows).sum() > len(part):
+                    self.links.append((self._densest(part), self._densest(parts[0])))
 
     def _measure(self) -> None:
         """Measure the reach of each group."""
