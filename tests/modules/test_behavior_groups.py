@@ -177,6 +177,30 @@ def test_joined_groups_stay_joined_when_clustered_anew():
         assert len(groups.numbers) == n_groups
 
 
+def test_joined_groups_stay_joined_when_one_of_them_splits():
+    """Of one joined group, two halves show in time; a behavior that comes later stays apart."""
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(count, place=0.0, halves=0.0):
+        inputs = place + torch.randn(count, 1, generator=generator)
+        inputs[1::2] += halves
+        return inputs
+
+    joined, plain = BehaviorGroups(1), BehaviorGroups(1)
+    first, other = draw(60, halves=4.5), draw(40, place=40.0)
+    for groups in (joined, plain):
+        show(groups, torch.cat([first, other]))
+        assert groups.numbers == [0, 1]
+    joined.join(0, 1)
+    more, new = draw(60, halves=4.5), draw(40, place=-40.0)
+    for shown, n_joined, n_plain in ((more, 1, 3), (new, 2, 4)):
+        for groups, expected in ((joined, n_joined), (plain, n_plain)):
+            show(groups, shown)
+            assert len(groups.numbers) == expected
+    assert group_of(joined, torch.cat([first, other])) == [0]
+    assert group_of(joined, new) == [2]
+
+
 # ---- the shipped banks
 
 
