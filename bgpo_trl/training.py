@@ -19,17 +19,19 @@ from bgpo_trl.algorithms import Algorithm, entry
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.logged_episodes import LoggedEpisodes
 from bgpo_trl.encoders.representation import Representation, check_savable
 from bgpo_trl.evaluation import Evaluator, evaluator_of
 from bgpo_trl.files.checkpoint import save_checkpoint
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.writing import lock_directory
+from bgpo_trl.logged import replay_logged
 from bgpo_trl.machine import interrupts_wait
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.cost import CostLog
 from bgpo_trl.runs.dashboard import Dashboard
 from bgpo_trl.runs.demonstrations import keep_inputs
-from bgpo_trl.runs.directory import RunLogger, fitting_checkpoint, load_last
+from bgpo_trl.runs.directory import RunLogger, digest_of_logged, fitting_checkpoint, load_last
 from bgpo_trl.scenes import find_scene
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import TaskSchedule
@@ -44,7 +46,8 @@ class Trainer:
     resumed with more ``config.episodes`` equals a run of that length. A run resumed with further
     tasks at the end (`bgpo_trl.runs.growth.add_task`) keeps all that it has learned.
 
-    With ``config.offline_updates``, each seed first learns from the demonstrations of the tasks
+    With ``logged``, the replay of each seed first gets these episodes (`replay_logged`). With
+    ``config.offline_updates``, it then learns from them and from the demonstrations of the tasks
     that are presented from the start (`BGPO.learn_offline`). A run that is interrupted meanwhile
     begins again when it is resumed.
 
@@ -66,16 +69,19 @@ class Trainer:
         encoders: Trained encoders, or None if unused.
         make: Constructor of the algorithm; by default that of the entry ``config.name``.
         device: Device of the networks; see `Algorithm`.
+        logged: Folder of logged episodes (`write_logged_episodes`). A run to be resumed that has a
+            checkpoint has learned them, and needs them no more.
         resume: Continue from the last checkpoint in the directory, if there is one.
         loggers: TorchRL's loggers, or functions without arguments that make one, called once the
             directory is accepted. They get the means that `Dashboard` lists.
         progress: Whether to show a progress bar.
 
     Raises:
-        ValueError: If the directory holds a run with other settings, encoders or demonstrations, of
-            another version of the scene, or any run and ``resume`` is False; if rows, checkpoint or
-            ``config.json`` of a run to resume are missing; if the bank has no demonstration of a
-            task, or is not of the encoders.
+        ValueError: If the directory holds a run with other settings, encoders, demonstrations or
+            logged episodes, of another version of the scene, or any run and ``resume`` is False; if
+            rows, checkpoint or ``config.json`` of a run to resume are missing; if the bank has no
+            demonstration of a task, or is not of the encoders; if the run cannot learn from the
+            logged episodes.
         BlockingIOError: If another process works in the directory.
     """
 
@@ -88,6 +94,7 @@ class Trainer:
         encoders: Representation | None = None,
         make: Callable[..., Algorithm] | None = None,
         device: torch.device | str = "cpu",
+        logged: str | Path | None = None,
         resume: bool = False,
         loggers: Iterable[Logger | Callable[[], Logger]] = (),
         progress: bool = True,
@@ -122,13 +129,19 @@ class Trainer:
                 "lower the run's spread, or record at a larger one"
             )
         bank = bank.for_tasks(config.tasks)
+        self._logged = None if logged is None else LoggedEpisodes.load(logged)
+        if self._logged is not None:
+            self._logged.check(config, self._scene)
+            learned = self._logged.identity
+        else:
+            learned = digest_of_logged(self.directory) if resume else None
         self.env_steps = 0
         # For the progress bar: the latest training episodes, and the latest evaluation.
         self._successes: deque[int] = deque(maxlen=100)
         self._tested = ""
         # Rows of seeds that finished early, kept for a resumed run with more episodes.
         self._later: list[dict[str, Any]] = []
-        self._settings = settings_of(config, Digests(used, bank.identity))
+        self._settings = settings_of(config, Digests(used, bank.identity, learned))
         self._state: TensorDictBase | None = None
         self._losses: dict[str, torch.Tensor] = {}
         with ExitStack() as opened:
@@ -226,6 +239,8 @@ class Trainer:
         """
         algorithm, env, n_episodes = self.algorithm, self.world.env, self.config.episodes
         if self._state is None:
+            if self._logged is not None:
+                replay_logged(self.algorithm, self._logged, progress=self.progress)
             if self.config.offline_updates:
                 self._learn_offline()
             self._state = env.reset()

@@ -22,7 +22,7 @@ LAYERS = (
     "experiments",
 )
 """In the order of docs/design.md; ``top`` is the package itself."""
-TOP = ("world", "evaluation", "training", "policy")
+TOP = ("world", "logged", "evaluation", "training", "policy")
 """Modules and packages of ``top``, in their order."""
 OPEN = ("configs", "errors", "seeding", "machine")
 """Open to all; they import from none of the layers."""

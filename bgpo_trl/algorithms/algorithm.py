@@ -240,6 +240,14 @@ class Algorithm(ABC):
     def store(self, transition: TensorDictBase) -> None:
         """Add a transition of each seed, ``[S]``, to the replay buffer."""
 
+    def store_logged(self, transition: TensorDictBase) -> None:
+        """Store a transition that none of the policies has played: `store` without the counts."""
+        proposals, self.proposals = self.proposals, None
+        try:
+            self.store(transition)
+        finally:
+            self.proposals = proposals
+
     def begin_task(self, index: int, task: int) -> None:  # noqa: B027 - most do not use it
         """Prepare for a further task of one seed; by default, do nothing.
 

@@ -187,11 +187,11 @@ class BGPO(Algorithm):
         return self._learn_active()
 
     def learn_offline(self, rows: Tensor, n_updates: int) -> Iterator[dict[str, Tensor]]:
-        """Learn from demonstrations alone, before the first episode.
+        """Learn from demonstrations, and logged episodes if any, before the first episode.
 
-        GWR-B and groups first learn all of them, so that they are stored with the behaviors and
-        groups at the end. Then each seed makes its updates, as many for each of its groups, in the
-        order of their numbers.
+        GWR-B and groups first learn all demonstrations, so that these are stored with the behaviors
+        and groups at the end. Then each seed makes its updates, as many for each of its groups, in
+        the order of their numbers.
 
         Args:
             rows: Positions in the bank, in the order of each seed, int64 ``[N, S]``.
@@ -211,12 +211,12 @@ class BGPO(Algorithm):
             for row in rows:
                 episode = self._episode_of(row)
                 self._store_demonstration(self.shown, episode, self._number(episode, "group"))
-        self._revision = [groups.revision for groups in self.groups]
+        self._follow_groups()
         numbers = [groups.numbers for groups in self.groups] or [[0]] * self.n_seeds
         for update in range(n_updates):
             with torch.no_grad():
                 self._play([of_seed[update * len(of_seed) // n_updates] for of_seed in numbers])
-            yield self._learn_active(share=1.0)
+            yield self._learn_active(share=None if len(self.replay) else 1.0)
 
     def _learn_demonstrations(self, rows: Tensor) -> None:
         """Have GWR-B and groups learn one demonstration of each seed, ``[S]``."""

@@ -31,9 +31,24 @@ def load_demonstrations(path: str | Path, *, verify: bool = True) -> TensorDict:
     ``verify`` compares the checksum, which reads the whole dataset.
 
     Raises:
-        ValueError: If it is missing, incomplete, damaged or of another version of its scene.
+        ValueError: If it is missing, incomplete, damaged, of another version of its scene, or of
+            logged episodes, which may have failed.
     """
-    path = Path(path)
+    dataset, meta = open_complete(Path(path), verify=verify)
+    if meta.get("logged"):
+        raise ValueError(
+            f"{path} holds logged episodes, which may have failed and are no demonstrations: give "
+            "them to a run (--logged), or write successful ones with write_demonstrations"
+        )
+    return dataset
+
+
+def open_complete(path: Path, *, verify: bool = True) -> tuple[TensorDict, dict[str, Any]]:
+    """Open demonstrations or logged episodes, memory-mapped; return them and their settings.
+
+    Raises:
+        ValueError: If they are missing, incomplete, damaged or of another version of their scene.
+    """
     meta = read_meta(path)
     # The scene of demonstrations from elsewhere need not be known here.
     version = find_scene(meta["scene"]).full_version if meta["scene"] in SCENES else None
@@ -48,7 +63,7 @@ def load_demonstrations(path: str | Path, *, verify: bool = True) -> TensorDict:
     dataset = open_dataset(path, meta)
     if verify and checksum_of(dataset) != meta["checksum"]:
         raise ValueError(f"{path} is damaged (checksum differs); remove it and {_REMEDY}")
-    return dataset
+    return dataset, meta
 
 
 def is_dataset(path: Path) -> bool:
@@ -190,6 +205,8 @@ def _empty(meta: Mapping[str, Any]) -> TensorDict:
         columns["joints"] = torch.zeros(()).expand(n, steps + 1, meta["joint_size"])
     if meta["action_size"]:
         columns["action"] = torch.zeros(()).expand(n, steps, meta["action_size"])
+    if meta.get("logged"):
+        columns["success"] = torch.zeros((), dtype=torch.bool).expand(n)
     return TensorDict(columns, [n])
 
 
@@ -245,11 +262,44 @@ def write_demonstrations(
         ([5, 3], [True, False])
     """
     scene = find_scene(scene)
-    tasks = list(episodes) if tasks is None else list(tasks)
-    scene.check_tasks(tasks)
     scene.check_spread(spread)
+    chosen = list(episodes) if tasks is None else list(tasks)
+    scene.check_tasks(chosen)
+    settings = {"held_out_per_task": held_out_per_task, "spread": float(spread)}
+    return _write(Path(path), scene, {task: episodes.get(task, ()) for task in chosen}, settings)
+
+
+def write_logged_episodes(path: str | Path, episodes: Episodes, *, scene: Scene | str) -> None:
+    """Write logged episodes, also failed ones, as a dataset that runs begin with (``--logged``).
+
+    Args:
+        path: Folder of the dataset, which must not exist.
+        episodes: Episodes by the name of their task. An episode is as in `write_demonstrations`,
+            with ``action``, what was executed, and ``success``, whether the last action solved the
+            task.
+        scene: The robot, or its name.
+
+    Raises:
+        ValueError: As from `write_demonstrations`, or if an episode lacks actions or success.
+        OSError: If there is not enough disk space, or the folder cannot be written.
+
+    Examples:
+        >>> frames, action = np.zeros((3, 32, 64, 3), np.uint8), np.zeros((2, 4))
+        >>> failed = {"pixels": frames, "action": action, "success": False}
+        >>> path = getfixture("tmp_path") / "log"
+        >>> write_logged_episodes(path, {"grasp_glass": [failed]}, scene="nico")
+    """
+    scene = find_scene(scene)
+    scene.check_tasks([*episodes])
+    settings = {"held_out_per_task": 0, "spread": 1.0, "logged": True}
+    _write(Path(path), scene, episodes, settings)
+
+
+def _write(path: Path, scene: Scene, episodes: Episodes, settings: Mapping[str, Any]) -> TensorDict:
+    """Check and write episodes, in the order of their tasks."""
+    tasks, held_out_per_task = [*episodes], settings["held_out_per_task"]
     _check_counts(episodes, tasks, held_out_per_task)
-    keys, lengths = _check_episodes(scene, episodes, tasks)
+    keys, lengths = _check_episodes(scene, episodes, logged="logged" in settings)
     meta = {
         **layout_of(
             scene,
@@ -260,8 +310,7 @@ def write_demonstrations(
         ),
         "tasks": tasks,
         "rows": len(lengths),
-        "held_out_per_task": held_out_per_task,
-        "spread": float(spread),
+        **settings,
     }
     with new_folder(path) as folder:
         dataset = make_dataset(folder, meta)
@@ -270,6 +319,9 @@ def write_demonstrations(
             n_shown = len(episodes[name]) - held_out_per_task
             for number in range(len(episodes[name])):
                 for key, values in episodes[name][number].items():
+                    if key == "success":
+                        dataset[key][row] = bool(values)
+                        continue
                     dataset[key][row, : len(values)] = torch.from_numpy(np.asarray(values).copy())
                 dataset["task"][row] = task
                 dataset["train"][row] = number < n_shown
@@ -320,16 +372,16 @@ def _check_counts(episodes: Episodes, tasks: Sequence[str], held_out_per_task: i
 
 
 def _check_episodes(
-    scene: Scene, episodes: Episodes, tasks: Sequence[str]
+    scene: Scene, episodes: Episodes, *, logged: bool
 ) -> tuple[set[str], list[int]]:
     """Return the keys of all episodes and the number of frames of each."""
     keys: set[str] | None = None
     lengths = []
-    for name in tasks:
+    for name in episodes:
         for number in range(len(episodes[name])):
             episode = episodes[name][number]
             try:
-                _check_keys(episode, keys)
+                _check_keys(episode, keys, logged)
                 lengths.append(check_episode(scene, episode))
             except ValueError as error:
                 raise ValueError(f"episode {number} of {name!r} {error}") from None
@@ -375,14 +427,19 @@ def check_episode(scene: Scene, episode: Mapping[str, Any]) -> int:
     return length
 
 
-def _check_keys(episode: object, keys: set[str] | None) -> None:
+def _check_keys(episode: object, keys: set[str] | None, logged: bool) -> None:
     if not isinstance(episode, Mapping):
         raise ValueError(
             f"is missing ({type(episode).__name__}): give its 'pixels', or leave the episode out"
         )
     names = ", ".join(repr(key) for key in episode) or "nothing"
-    if "pixels" not in episode or not {*episode} <= {*_KEYS}:
-        raise ValueError(f"has {names}: give 'pixels', and if known 'action', 'joints', 'state'")
+    least = {"pixels", "action", "success"} if logged else {"pixels"}
+    if not least <= {*episode} <= {*_KEYS, *least}:
+        wanted = ", ".join(repr(key) for key in (*_KEYS, "success") if key in least)
+        known = ", ".join(repr(key) for key in _KEYS if key not in least)
+        raise ValueError(f"has {names}: give {wanted}, and if known {known}")
+    if logged and type(episode["success"]) not in (bool, np.bool_):
+        raise ValueError(f"has the success {episode['success']!r}: give True or False")
     if keys not in (None, {*episode}):
         raise ValueError(
             f"has {names}, those before it {', '.join(map(repr, sorted(keys)))}: give actions, "

@@ -34,8 +34,8 @@ except ImportError as error:
 
 _VIDEO = "videos/{}/chunk-{:03d}/file-{:03d}.mp4"
 
-Episode = dict[str, NDArray[Any]]
-"""Entries of an episode, see `write_demonstrations`."""
+Episode = dict[str, Any]
+"""Entries of an episode, see `write_demonstrations` and `write_logged_episodes`."""
 
 
 def read_lerobot(
@@ -51,8 +51,9 @@ def read_lerobot(
     tasks: Collection[str] | None = None,
     stride: int = 1,
     combine: Callable[[NDArray[np.float32]], ArrayLike] | None = None,
+    logged: bool = False,
 ) -> dict[str, list[Episode]]:
-    """Read a LeRobot dataset of version 3 as episodes for `write_demonstrations`.
+    """Read a LeRobot dataset of version 3 as demonstrations, or as logged episodes.
 
     The frames of the chosen episodes are held in memory, in the size of ``frame_shape``. Actions
     must have the meaning of the scene's, in [-1, 1]: scale them, or leave them out. Frames that are
@@ -75,16 +76,18 @@ def read_lerobot(
         combine: With a stride, function from the actions between two frames that are read,
             ``[stride, A]``, to one action ``[A]``, such as their sum if they are displacements,
             or the last if they are targets.
+        logged: Read episodes for `write_logged_episodes`, also failed ones, with ``success``.
 
     Returns:
         Episodes in their order by the description of their task: ``pixels`` uint8
         ``[T, H, W, 3]`` and, as asked for, ``action`` ``[T - 1, A]``, ``state`` ``[T, N]`` and
-        ``joints`` ``[T, J]``, float32. Rename the tasks to those of the scene.
+        ``joints`` ``[T, J]``, float32, and ``success``. Rename the tasks to those of the scene.
 
     Raises:
         ValueError: If the folder is no LeRobot dataset of version 3, a file is damaged or missing,
             an episode is incomplete or failed, a frame is missing or not at its time, images have
-            more than 8 bits a color, or a feature, episode or task to read is not there.
+            more than 8 bits a color, a feature, episode or task to read is not there, or logged
+            episodes do not say whether they succeeded.
     """
     wanted = {"action": action_key, "state": state_key, "joints": joints_key}
     chosen = {key: name for key, name in wanted.items() if name is not None}
@@ -95,7 +98,12 @@ def read_lerobot(
         )
     reader = _Reader(Path(path), image_key, frame_shape)
     reader.check_numeric(chosen)
-    found = reader.read(chosen, success_key, episodes, tasks, stride)
+    if logged and success_key not in reader.features:
+        raise ValueError(
+            f"{path} has no {success_key!r}, by which logged episodes say whether they succeeded: "
+            f"give one of its features as success_key, {', '.join(reader.features)}"
+        )
+    found = reader.read(chosen, success_key, episodes, tasks, stride, logged)
     if "action" in chosen and stride > 1 and combine is not None:
         for episode in itertools.chain(*found.values()):
             between = episode["action"].reshape(-1, stride, episode["action"].shape[-1])
@@ -184,6 +192,7 @@ class _Reader:
         episodes: Collection[int] | None,
         tasks: Collection[str] | None,
         stride: int,
+        logged: bool,
     ) -> dict[str, list[Episode]]:
         """Return the episodes by task, with some of the features under other keys."""
         names = self._task_names()
@@ -222,11 +231,13 @@ class _Reader:
             name = names[labels.pop()]
             if name not in found or (episodes is not None and number not in episodes):
                 continue
-            if success and not _scalars(own[success[0]]).any():
+            succeeded = not success or bool(_scalars(own[success[0]]).any())
+            if not (succeeded or logged):
                 failed.append(number)
             elif not failed:
                 with _reading(f"episode {number} of {self.path}"):
-                    found[name].append(self._episode(own, chosen, place, stride))
+                    episode = self._episode(own, chosen, place, stride)
+                found[name].append({**episode, "success": succeeded} if logged else episode)
         if failed:
             raise ValueError(
                 f"{self.path} has episodes that failed, without {success_key!r}: {_some(failed)}; "

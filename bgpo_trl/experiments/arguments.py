@@ -85,6 +85,10 @@ class Arguments(BankArguments):
     """With --resume, a further task for the run, which learns it from the next episode that no seed
     has begun, and keeps what it has learned. Demonstrations are taken from --bank, embedded by the
     run's encoders (`bgpo bank`), or from beside these. A finished run needs more --episodes."""
+    logged: Path | None = None
+    """Logged episodes of write_logged_episodes, of tasks presented from the start, for the replay
+    before the first episode; with --offline-updates, also to learn from by then. --resume needs
+    them no more."""
     train_encoders: bool = False
     """Record demonstrations and train new encoders instead of using the pretrained ones."""
     wandb: Literal["online", "offline"] | None = None

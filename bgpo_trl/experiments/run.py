@@ -104,6 +104,7 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
             bank=bank,
             encoders=encoders,
             device=device,
+            logged=arguments.logged,
             resume=arguments.resume,
             loggers=loggers,
         ) as trainer:

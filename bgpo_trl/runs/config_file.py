@@ -22,10 +22,12 @@ class Digests(NamedTuple):
     Attributes:
         encoders: That of its encoders; None if it used none.
         bank: That of the demonstrations of its tasks; None in files that are of no run.
+        logged: That of the logged episodes that it began with; None, and not stored, without any.
     """
 
     encoders: str | None
     bank: str | None
+    logged: str | None = None
 
 
 class _Loader(yaml.SafeLoader):
@@ -130,7 +132,7 @@ def settings_of(config: RunConfig, digests: Digests) -> dict[str, Any]:
         "algorithm_class": f"{kind.__module__}.{kind.__qualname__}",
         "scene_version": scene.full_version,
         "task_modules": dict(scene.modules(config.tasks)),
-        **digests._asdict(),
+        **{name: found for name, found in digests._asdict().items() if found or name != "logged"},
     }
     return _as_json(settings)
 

@@ -39,6 +39,14 @@ def check_settings(
         _compare(directory, read_json(path), settings, longer)
 
 
+def digest_of_logged(directory: Path) -> str | None:
+    """Return the digest of the logged episodes that a run with a checkpoint has learned, if any."""
+    path = directory / "config.json"
+    if not path.exists() or not has_checkpoint(directory / "checkpoint"):
+        return None
+    return read_json(path).get("logged")
+
+
 def load_last(directory: Path, settings: Mapping[str, Any]) -> dict[str, Any] | None:
     """Read the checkpoint that a run resumes from, without changing any file.
 

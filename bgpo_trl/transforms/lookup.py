@@ -161,6 +161,10 @@ class GroupLookup(DemonstrationLookup):
         learn: As for `DemonstrationLookup`.
         starts: First latent of each demonstration by its index, float32 ``[N, 64]``.
 
+    Attributes:
+        tries: Whether experts are tried and successes counted: False for episodes that no expert
+            plays.
+
     Raises:
         ValueError: As from `DemonstrationLookup`.
 
@@ -180,6 +184,7 @@ class GroupLookup(DemonstrationLookup):
     reads = ("demo_embedding", "latent", "demo_index", "success")
     writes = ("group", "group_novelty", "group_fits", "expert")
     network: Sequence[BehaviorGroups]
+    tries: bool = True
 
     def __init__(
         self,
@@ -203,7 +208,7 @@ class GroupLookup(DemonstrationLookup):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         self.forward(tensordict_reset)
-        if self.learn and self.starts is not None:
+        if self.learn and self.tries and self.starts is not None:
             latent = self._of_rows(tensordict_reset.get("latent"))[:, 0]
             group, _, fits, expert = self._written(tensordict_reset)
             for row in starting(tensordict).flatten().nonzero().flatten().tolist():
@@ -221,9 +226,10 @@ class GroupLookup(DemonstrationLookup):
                 groups.adapt(phi[row])
                 continue
             index = int(tensordict.get("demo_index").flatten()[row])
-            success = bool(next_tensordict.get("success").flatten()[row])
             groups.adapt(phi[row], self.starts[index])
-            groups.end(int(group[row]), int(expert[row]), fits=bool(fits[row]), success=success)
+            if self.tries:
+                success = bool(next_tensordict.get("success").flatten()[row])
+                groups.end(int(group[row]), int(expert[row]), fits=bool(fits[row]), success=success)
 
     def _written(self, tensordict: TensorDictBase) -> list[Tensor]:
         """Return views of the entries written, by row ``[S]``."""

@@ -23,7 +23,11 @@ pa = pytest.importorskip("pyarrow")
 import pyarrow.parquet as pq  # noqa: E402
 
 from bgpo_trl.data import lerobot  # noqa: E402
-from bgpo_trl.data.dataset import resize_frames, write_demonstrations  # noqa: E402
+from bgpo_trl.data.dataset import (  # noqa: E402
+    resize_frames,
+    write_demonstrations,
+    write_logged_episodes,
+)
 from bgpo_trl.data.lerobot import read_lerobot, write_lerobot  # noqa: E402
 from tests.helpers import edit  # noqa: E402
 
@@ -235,6 +239,14 @@ def test_failed_episodes_are_no_demonstrations_unless_asked_for(written, refused
     refused(lambda: read_lerobot(written), "failed, without 'next.success': 1, 2", "episodes=...")
     assert [len(some) for some in read_lerobot(written, episodes=[0]).values()] == [0, 1]
     assert [len(some) for some in read_lerobot(written, success_key=None).values()] == [1, 2]
+    logged = read_lerobot(written, logged=True)
+    found = [[one["success"] for one in logged[task]] for task in TASKS]
+    assert found == [[False], [True, False]]
+    write_logged_episodes(written.parent / "log", logged, scene="nico")
+
+
+def test_logged_episodes_without_success_are_refused(written, refused):
+    refused(lambda: read_lerobot(written, logged=True), "no 'next.success'", "success_key")
 
 
 def test_some_episodes_tasks_and_frames_are_read(written):

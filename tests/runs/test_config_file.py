@@ -62,7 +62,7 @@ def test_missing_settings_get_their_defaults(tmp_path):
     settings = asdict(RunConfig())
     del settings["checkpoint_minutes"], settings["algorithm"]["rl"]["critic_layer_norm"]
     (tmp_path / "config.json").write_text(json.dumps(settings))
-    assert read_config(tmp_path / "config.json") == (RunConfig(), (None, None))
+    assert read_config(tmp_path / "config.json") == (RunConfig(), Digests(None, None))
 
 
 def nested(**rl):

@@ -1,0 +1,306 @@
+"""Runs that begin with logged episodes."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from bgpo_trl.algorithms.proposal_trials import ProposalTrials
+from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations, write_logged_episodes
+from bgpo_trl.data.logged_episodes import LoggedEpisodes
+from bgpo_trl.encoders.representation import Representation
+from bgpo_trl.logged import replay_logged
+from bgpo_trl.modules.group_trials import GroupTrials
+from bgpo_trl.scenes.nico import NICO
+from tests.helpers import interrupt, rows
+from tests.scenes.dot import scene as dot_scene
+from tests.test_training import assert_same_run
+
+pytestmark = pytest.mark.usefixtures("easy_world")
+GRASP, PUSH, LATER = "grasp_glass", "push_green_to_glass", "push_green_to_white"
+
+
+def episode(n_steps, *, success, seed=0, shape=(32, 64), size=4):
+    """An episode of noise."""
+    noise = np.random.default_rng(seed)
+    return {
+        "pixels": noise.integers(0, 256, (n_steps + 1, *shape, 3), dtype=np.uint8),
+        "action": noise.uniform(-1, 1, (n_steps, size)).astype(np.float32),
+        "success": success,
+    }
+
+
+LOG = {
+    GRASP: [episode(3, success=True, seed=1), episode(2, success=False, seed=2)],
+    PUSH: [episode(1, success=True, seed=3), episode(6, success=False, seed=4)],
+}
+EPISODES = [one for some in LOG.values() for one in some]
+N_STEPS = 3 + 2 + 1 + 6
+
+
+@pytest.fixture
+def log(tmp_path):
+    """Folder of four logged episodes."""
+    write_logged_episodes(tmp_path / "log", LOG, scene="nico")
+    return tmp_path / "log"
+
+
+@pytest.fixture
+def logged_config(make_config):
+    """Settings of a run in which the tasks of the log are presented from the start."""
+
+    def make(name="bgpo", **changes):
+        return make_config(name=name, **{"task_starts": (0, 0, 4), **changes})
+
+    return make
+
+
+@pytest.fixture
+def learned(begin, logged_config, log, tmp_path):
+    """Return the algorithm of a run that has got the logged episodes and not begun to play."""
+
+    def make(name="bgpo", **changes):
+        with begin(tmp_path / f"{name}-{len(changes)}", logged_config(name, **changes)) as trainer:
+            replay_logged(trainer.algorithm, LoggedEpisodes.load(log), progress=False)
+        return trainer.algorithm
+
+    return make
+
+
+def test_the_replay_holds_the_log(learned, encoders: Representation, bank):
+    algorithm = learned()
+    for seed in range(2):
+        held, group = algorithm.replay.contents(seed)
+        assert len(held) == N_STEPS
+        of_task = bank.seen().task[held["demo_index"]]
+        assert of_task.tolist() == [0] * 5 + [1] * 7
+        at = 0
+        for one in EPISODES:
+            own, at = held[at : at + len(one["action"])], at + len(one["action"])
+            latent = encoders.frame_network.latent(torch.from_numpy(one["pixels"]))
+            bounded = latent.clamp(-5, 5)
+            torch.testing.assert_close(own["latent"], bounded[:-1], rtol=0, atol=1e-5)
+            torch.testing.assert_close(own["next", "latent"], bounded[1:], rtol=0, atol=1e-5)
+            assert torch.equal(own["action"], torch.from_numpy(one["action"]))
+            assert own["demo_index"].unique().numel() == 1
+            # The context is the scaled behavior, by which the bonus is measured.
+            behavior = own["context"][0] / algorithm.config.behavior_scale
+            phi = encoders.lae.encode(latent[None], torch.tensor([len(latent)]))[0]
+            bonus = algorithm.beta * (-(behavior - phi).norm()).exp()
+            last = [False] * (len(own) - 1) + [True]
+            reward = torch.tensor(last).float() * (one["success"] + bonus)
+            torch.testing.assert_close(own["next", "reward"][:, 0], reward, rtol=0, atol=1e-5)
+            assert own["next", "done"].flatten().tolist() == last
+            terminated = own["next", "terminated"].flatten().tolist()
+            assert terminated == [one["success"] and end for end in last]
+        assert (group == 0).all()
+    indices = [algorithm.replay.contents(seed)[0]["demo_index"] for seed in range(2)]
+    assert (indices[0] != indices[1]).any()
+
+
+def test_a_failure_ends_as_a_timeout_of_the_algorithm(learned, logged_config):
+    config = replace(logged_config().algorithm, timeouts_bootstrap=False)
+    held, _ = learned(algorithm=config).replay.contents(0)
+    assert torch.equal(held["next", "terminated"], held["next", "done"])
+    assert held["next", "done"].flatten().nonzero().flatten().tolist() == [2, 4, 5, 11]
+
+
+@pytest.mark.parametrize(
+    "name", ["maml-demonstrations", "dist-nll-demonstrations", "oracle-demonstrations", "ewc"]
+)
+def test_other_algorithms_get_the_same_transitions(learned, name):
+    ours, theirs = (learned(of).replay.contents(1)[0] for of in ("bgpo", name))
+    for key in ("latent", "action", ("next", "latent"), ("next", "terminated")):
+        assert torch.equal(ours[key], theirs[key])
+    assert theirs["next", "reward"].flatten().nonzero().flatten().tolist()[:1] == [2]
+
+
+def test_demonstrations_are_learned_and_no_success_is_counted(learned):
+    algorithm = learned(seeds=(3,))
+    assert len(algorithm.shown) == len(EPISODES)
+    assert algorithm.groups[0].shown.sum() == len(EPISODES)
+    assert int(algorithm.gwr.num_nodes[0]) >= 2
+    fresh = GroupTrials(algorithm.groups[0].trials.seed)
+    assert algorithm.groups[0].trials.state_dict() == fresh.state_dict()
+    rl = algorithm.config.rl
+    none = ProposalTrials(1, clone_episodes=rl.clone_episodes, clone_share=rl.clone_share)
+    assert algorithm.proposals.state_dict() == none.state_dict()
+
+
+def test_a_run_learns_from_the_log_before_its_own_episodes(begin, logged_config, log, tmp_path):
+    config = logged_config(offline_updates=4, seeds=(3,))
+    logged = torch.from_numpy(np.concatenate([one["action"] for one in EPISODES]))
+    with begin(tmp_path / "run", config, logged=log) as trainer:
+        learn, batches = trainer.algorithm.learner.learn, []
+
+        def watch(batch):
+            batches.append(batch)
+            return learn(batch)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(trainer.algorithm.learner, "learn", watch)
+            interrupt(trainer, N_STEPS + 1)
+    for batch in batches[:4]:  # 8 rows, of which a quarter is of demonstrations
+        known = (batch["action"][0, 0, :, None] == logged).all(-1).any(-1)
+        assert known.tolist() == [True] * 6 + [False] * 2
+        assert (batch["priority_weight"] == 1).all()
+    with begin(tmp_path / "run", config, resume=True) as trainer:
+        trainer.run()
+    train = rows(tmp_path / "run" / "train.csv")
+    assert [int(row["episode"]) for row in train] == [*range(1, config.episodes + 1)]
+    assert int(train[0]["env_steps"]) == int(train[0]["steps"])
+
+
+@pytest.mark.parametrize("offline_updates", [0, 3])
+def test_an_interrupted_run_equals_one_that_is_not(
+    begin, logged_config, log, tmp_path, monkeypatch, offline_updates
+):
+    config = logged_config(offline_updates=offline_updates)
+    with begin(tmp_path / "straight", config, logged=log) as trainer:
+        trainer.run()
+    run = tmp_path / "run"
+    with begin(run, config, logged=log) as trainer:
+        store, counts = trainer.algorithm.store_logged, iter(range(N_STEPS))
+
+        def stop(transition):
+            if next(counts) == 7:
+                raise KeyboardInterrupt
+            store(transition)
+
+        monkeypatch.setattr(trainer.algorithm, "store_logged", stop)
+        with pytest.raises(KeyboardInterrupt):
+            trainer.run()
+    with begin(run, config, logged=log, resume=True) as trainer:
+        interrupt(trainer, N_STEPS + 5)
+    shutil.rmtree(log)  # learned before the first checkpoint
+    with begin(run, config, resume=True) as trainer:
+        trainer.run()
+    assert_same_run(run, tmp_path / "straight")
+    assert len(json.loads((run / "config.json").read_text())["logged"]) == 64
+
+
+def test_seeds_alone_equal_seeds_of_a_batch(begin, logged_config, log, tmp_path):
+    made = []
+    for seeds in ((3, 8), (8,)):
+        config = logged_config(seeds=seeds, offline_updates=3)
+        with begin(tmp_path / f"{len(seeds)}", config, logged=log) as trainer:
+            interrupt(trainer, N_STEPS + 1)
+        made.append(trainer.algorithm)
+    both, alone = made
+    for ours, theirs in zip(both.replay.contents(1), alone.replay.contents(0), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-5)
+    first, second = both.actor_weights(1), alone.actor_weights(0)
+    for key, value in first.items():
+        torch.testing.assert_close(value, second[key], rtol=0, atol=1e-5)
+
+
+def of_dot(path, config):
+    log = {"left": [episode(2, success=True, shape=(16, 24), size=1)]}
+    write_logged_episodes(path, log, scene=dot_scene())
+    return config
+
+
+def of_task(task):
+    def write(path, config):
+        write_logged_episodes(path, {task: [episode(2, success=True)]}, scene="nico")
+        return config
+
+    return write
+
+
+def without_success(path, config):
+    shown = {key: value for key, value in episode(2, success=True).items() if key != "success"}
+    write_demonstrations(path, {GRASP: [shown]}, scene="nico", held_out_per_task=0)
+    return config
+
+
+def too_long(path, config):
+    write_logged_episodes(path, {GRASP: [episode(7, success=False)]}, scene="nico")
+    return config
+
+
+def with_algorithm(**changes):
+    def write(path, config):
+        write_logged_episodes(path, LOG, scene="nico")
+        rl = replace(config.algorithm.rl, **changes)
+        return replace(config, algorithm=replace(config.algorithm, rl=rl))
+
+    return write
+
+
+def of_ground_truth(path, config):
+    write_logged_episodes(path, LOG, scene="nico")
+    rl = replace(config.algorithm.rl, proposals="actor", imitation=0.0)
+    changes = {"state": "state", "demonstration_share": 0.0, "rl": rl}
+    return replace(config, algorithm=replace(config.algorithm, **changes))
+
+
+@pytest.mark.parametrize(
+    ("write", "cause", "remedy"),
+    [
+        (of_dot, "is of the scene dot dot-1", "take what is of 'nico'"),
+        (of_task(LATER), f"episodes of ['{LATER}']", "task_starts"),
+        (without_success, "does not say which episodes succeeded", "write_logged_episodes"),
+        (too_long, "7 steps", "raise max_steps"),
+        (with_algorithm(replay_size=16, batch_size=8), "", ""),
+        (with_algorithm(replay_size=8, batch_size=8), "12 steps, the replay holds 8", "raise"),
+        (with_algorithm(proposals="clone"), "learns from demonstrations alone", "leave them out"),
+        (of_ground_truth, "no ['state']", "choose an algorithm"),
+    ],
+)
+def test_a_log_that_does_not_fit_is_refused(
+    begin, logged_config, tmp_path, refused, write, cause, remedy
+):
+    config = write(tmp_path / "log", logged_config())
+    if not cause:
+        begin(tmp_path / "run", config, logged=tmp_path / "log").close()
+    else:
+        call = lambda: begin(tmp_path / "run", config, logged=tmp_path / "log")  # noqa: E731
+        refused(call, cause, remedy)
+
+
+@pytest.mark.parametrize(
+    ("changes", "cause"),
+    [
+        ({"action": np.full((2, 4), np.nan)}, "has a action that is not finite"),
+        ({"action": np.full((2, 4), 1.5)}, "an action of size 1.5"),
+        ({"success": 1}, "has the success 1: give True or False"),
+        ({"reward": 1.0}, "give 'pixels', 'action', 'success'"),
+    ],
+)
+def test_episodes_that_are_not_logged_as_they_should_be_are_not_written(
+    tmp_path, refused, changes, cause
+):
+    log = {GRASP: [{**episode(2, success=True), **changes}]}
+    call = lambda: write_logged_episodes(tmp_path / "log", log, scene="nico")  # noqa: E731
+    refused(call, f"episode 0 of {GRASP!r}", cause)
+
+
+def test_actions_that_are_nan_in_the_file_are_refused(logged_config, log):
+    logged = LoggedEpisodes.load(log)
+    broken = replace(logged, episodes=logged.episodes.clone())
+    broken.episodes["action"][0, 0] = torch.nan
+    config = logged_config()
+    logged.check(config, NICO)
+    with pytest.raises(ValueError, match="must have actions of 4 numbers"):
+        broken.check(config, NICO)
+
+
+def test_logged_episodes_are_no_demonstrations(log, refused):
+    refused(lambda: load_demonstrations(log), "may have failed", "--logged")
+
+
+def test_other_logs_are_refused_when_a_run_is_resumed(begin, logged_config, log, tmp_path, refused):
+    run, other = tmp_path / "run", tmp_path / "other"
+    with begin(run, logged_config(), logged=log) as trainer:
+        interrupt(trainer, N_STEPS + 2)
+    write_logged_episodes(other, {GRASP: LOG[GRASP]}, scene="nico")
+    again = lambda: begin(run, logged_config(), logged=other, resume=True)  # noqa: E731
+    refused(again, "logged is ", "choose another")
+    shutil.rmtree(run / "checkpoint")
+    for name in ("train.csv", "eval.csv"):
+        (run / name).unlink()
+    refused(lambda: begin(run, logged_config(), resume=True), "logged is ", "choose another")
