@@ -20,7 +20,8 @@ from bgpo_trl.modules.gwr import Numbers, as_tensor
 _KNOWN_SHARE = 0.99  # of a group's own demonstrations that are to count as known
 _FITTING_SHARE = 0.9  # of a group's own demonstrations whose starts are to count as fitting
 _ROUNDING = 1e-4  # of a vector's length; shipped demonstrations differ by 600 times as much
-_ARRAYS = ("points", "starts", "shown", "group", "member", "cluster")  # of the state
+# Of the state.
+_ARRAYS = ("points", "starts", "shown", "tried", "won", "group", "member", "cluster")
 _LISTS = ("parent", "links", "joined")
 
 
@@ -67,8 +68,9 @@ class BehaviorGroups:
        is the group with which it has most in common.
     4. Groups that turn out to be one behavior can be joined (`join`), and stay so: the clusters of
        their densest demonstrations are one group from then on. If such a group splits, a cluster
-       more than half of whose demonstrations were in the group when it was joined still belongs
-       to it.
+       still belongs to it if the group's expert has succeeded after the cluster's demonstrations,
+       by the criteria of 7. The first demonstrations of a new task may be of this group too, but
+       its expert does not solve them.
 
     A task that looks different from different starts, such as a push to the left or to the right,
     forms several groups. The expert of each does not know what to do where the group's own
@@ -96,6 +98,8 @@ class BehaviorGroups:
         points: The different demonstrations, in the order in which they were first shown, [n, d].
         starts: First state of each, [n, f]; f is 0 if they are not given.
         shown: How often each was shown, [n].
+        tried: How often the expert of its group then played, [n].
+        won: How often this expert succeeded, [n].
         group: Group of each, [n].
         member: Whether it is in the cluster of the group, [n]; False for outliers, and for those
             that have come since all were clustered.
@@ -103,7 +107,7 @@ class BehaviorGroups:
             outliers.
         parent: Parent of each group, by number; that of group 0 is 0.
         links: Pairs of demonstrations whose clusters are one group.
-        joined: For each time that two groups were joined, the demonstrations in their clusters.
+        joined: Numbers of the groups that were joined from others.
         revision: How often earlier demonstrations have changed their groups.
 
     Examples:
@@ -119,12 +123,14 @@ class BehaviorGroups:
     points: NDArray[np.float64]
     starts: NDArray[np.float32]
     shown: NDArray[np.int64]
+    tried: NDArray[np.int64]
+    won: NDArray[np.int64]
     group: NDArray[np.int64]
     member: NDArray[np.bool_]
     cluster: NDArray[np.int64]
     parent: list[int]
     links: list[tuple[int, int]]
-    joined: list[list[int]]
+    joined: list[int]
     revision: int
 
     def __init__(
@@ -141,7 +147,9 @@ class BehaviorGroups:
         self.trials = GroupTrials(seed)
         self.points, self.starts = np.empty((0, self.n_features)), np.empty((0, 0), np.float32)
         self.member = np.empty(0, np.bool_)
-        self.shown, self.group, self.cluster = (np.empty(0, np.int64) for _ in range(3))
+        self.shown, self.tried, self.won = (np.empty(0, np.int64) for _ in range(3))
+        self.group, self.cluster = (np.empty(0, np.int64) for _ in range(2))
+        self._latest = 0  # the demonstration shown last
         self.parent, self.links, self.joined, self.revision = [0], [], [], 0
         # Linear map [d, d] after which distances are measured.
         self._metric = np.eye(self.n_features)
@@ -163,10 +171,13 @@ class BehaviorGroups:
             raise ValueError(
                 f"groups to join must be two of {self.numbers}, got {first} and {second}"
             )
-        rows = [np.flatnonzero(self.member & (self.group == group)) for group in (first, second)]
-        self.links.append((self._densest(rows[0]), self._densest(rows[1])))
-        self.joined.append(np.concatenate(rows).tolist())
+        one, other = (
+            self._densest(np.flatnonzero(self.member & (self.group == group)))
+            for group in (first, second)
+        )
+        self.links.append((one, other))
         self._arrange()
+        self.joined.append(int(self.group[one]))
 
     def lookup(self, phi: Numbers) -> GroupMatch:
         """Return the groups ``[*B]`` of inputs ``[*B, d]``.
@@ -211,6 +222,9 @@ class BehaviorGroups:
         """Count an episode, given the results of `expert`; join groups that are one task."""
         if {group, expert} <= {*self.numbers}:
             self.trials.count(group, expert, fits=fits, success=success)
+        if group == expert:
+            self.tried[self._latest] += 1
+            self.won[self._latest] += success
         if (pair := self.trials.same_task()) is not None:
             self.join(*pair)
 
@@ -325,9 +339,13 @@ class BehaviorGroups:
             self.points = np.concatenate([self.points, point[None]])
             starts = self.starts.reshape(len(self.starts), len(start))  # of no width before
             self.starts = np.concatenate([starts, start[None]])
-            self.shown, self.group = np.append(self.shown, 0), np.append(self.group, group)
+            self.shown, self.tried, self.won = (
+                np.append(counts, 0) for counts in (self.shown, self.tried, self.won)
+            )
+            self.group = np.append(self.group, group)
             self.member = np.append(self.member, False)
         self.shown[same] += 1
+        self._latest = int(same.argmax())
         return is_new
 
     def _densest(self, rows: NDArray[np.int64]) -> int:
@@ -375,17 +393,25 @@ class BehaviorGroups:
         return labels
 
     def _link_fragments(self) -> None:
-        """Link the clusters into which joined groups have split."""
-        for rows in self.joined:
+        """Link the clusters into which joined groups have split to the largest of each group."""
+        for number in sorted({*self.joined}):
             labels = self._linked()
-            found, counts = np.unique(labels[rows][labels[rows] >= 0], return_counts=True)
+            of_group = (self.group[: len(labels)] == number) & (labels >= 0)
+            found, counts = np.unique(labels[of_group], return_counts=True)
             parts = [
                 np.flatnonzero(labels == label)
                 for label in found[np.argsort(-counts, kind="stable")]
             ]
             for part in parts[1:]:
-                if 2 * np.isin(part, rows).sum() > len(part):
+                of_part = part[of_group[part]]
+                if 2 * len(of_part) > len(part) and self._solves(of_part, parts[0]):
                     self.links.append((self._densest(part), self._densest(parts[0])))
+
+    def _solves(self, part: NDArray[np.int64], others: NDArray[np.int64]) -> bool:
+        """Return whether a group's expert solves a part of its demonstrations like others."""
+        rate = self.won[others].sum() / max(1, self.tried[others].sum())
+        won, half = self.won[part].sum(), self.tried[part].sum() * rate / 2
+        return bool(won >= max(self.trials.successes, half - half**0.5))
 
     def _measure(self) -> None:
         """Measure the reach of each group."""

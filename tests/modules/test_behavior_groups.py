@@ -177,8 +177,9 @@ def test_joined_groups_stay_joined_when_clustered_anew():
         assert len(groups.numbers) == n_groups
 
 
-def test_joined_groups_stay_joined_when_one_of_them_splits():
-    """Of one joined group, two halves show in time; a behavior that comes later stays apart."""
+@pytest.mark.parametrize(("solved", "n_groups"), [(True, 1), (False, 2)])
+def test_a_part_of_a_joined_group_parts_unless_the_groups_expert_solves_it(solved, n_groups):
+    """The first of two joined groups falls into halves in time, like a new task beside an old."""
     generator = torch.Generator().manual_seed(0)
 
     def draw(count, place=0.0, halves=0.0):
@@ -186,19 +187,28 @@ def test_joined_groups_stay_joined_when_one_of_them_splits():
         inputs[1::2] += halves
         return inputs
 
-    joined, plain = BehaviorGroups(1), BehaviorGroups(1)
-    first, other = draw(60, halves=4.5), draw(40, place=40.0)
-    for groups in (joined, plain):
-        show(groups, torch.cat([first, other]))
-        assert groups.numbers == [0, 1]
-    joined.join(0, 1)
-    more, new = draw(60, halves=4.5), draw(40, place=-40.0)
-    for shown, n_joined, n_plain in ((more, 1, 3), (new, 2, 4)):
-        for groups, expected in ((joined, n_joined), (plain, n_plain)):
-            show(groups, shown)
-            assert len(groups.numbers) == expected
-    assert group_of(joined, torch.cat([first, other])) == [0]
-    assert group_of(joined, new) == [2]
+    groups, plain = BehaviorGroups(1), BehaviorGroups(1)
+
+    def play(inputs):
+        """All of the group is solved every other time, the upper half perhaps never."""
+        for number, phi in enumerate(inputs):
+            group = int(groups.adapt(phi).group)
+            upper = 2.25 < float(phi) < 20
+            success = number % 4 < 2 and (solved or not upper)
+            groups.end(group, group, fits=True, success=success)
+            plain.adapt(phi)
+
+    play(torch.cat([draw(60, halves=4.5), draw(40, place=40.0)]))
+    assert groups.numbers == plain.numbers == [0, 1]
+    groups.join(0, 1)
+    play(draw(60, halves=4.5))
+    assert len(plain.numbers) == 3
+    assert len(groups.numbers) == n_groups
+    restored = BehaviorGroups(1)
+    restored.load_state_dict(groups.state_dict())
+    for each in (groups, restored):
+        show(each, draw(40, place=-40.0))  # of what nobody has solved
+        assert len(each.numbers) == n_groups + 1
 
 
 # ---- the shipped banks
