@@ -137,8 +137,8 @@ class AlgorithmConfig(Settings):
     """Hyperparameters common to all algorithms, which are thus compared on equal terms."""
 
     state: Literal["latent", "state"] = "latent"
-    """Observation of the policy: the latent z of a frame (Alg. 1) or, for
-    the study of privileged information, the ground truth."""
+    """Observation of the policy: the latent z of a frame (Alg. 1) or the ground truth, to see
+    what latents cost."""
     joints: bool = False
     """Whether policies and critics read the robot's joints beside the latent, in a scene that has
     them (`Scene.joints`). Ours."""

@@ -4,7 +4,6 @@ import shutil
 from dataclasses import replace
 from functools import cache
 
-import privileged_information
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
@@ -25,10 +24,9 @@ from suites.nico.base import STATE_CENTER, STATE_SCALE
 def tiny(monkeypatch, encoders, bank, make_config):
     """Untrained encoders, runs of a second and two final test episodes of each task."""
     config = make_config(episodes=6)
-    for module in (experiment, pretrained, privileged_information):
+    for module in (experiment, pretrained):
         monkeypatch.setattr(module, "load_pretrained", lambda *_, **__: (encoders, bank))
-    for module in (settings, privileged_information):
-        monkeypatch.setattr(module, "PRESETS", {"quick": config, "desk": config})
+    monkeypatch.setattr(settings, "PRESETS", {"quick": config, "desk": config})
     for name, entry in ALGORITHMS.items():
         small = replace(entry, config=make_config(name=name).algorithm)
         monkeypatch.setitem(ALGORITHMS, name, small)

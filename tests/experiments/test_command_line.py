@@ -55,7 +55,6 @@ CASES = [
     ("bgpo continual --config new", "--config"),
     ("eight_tasks.py --eval-every 0", "eval_every"),
     ("bgpo continual --eval-episodes 0", "set eval_episodes to at least 1"),
-    ("studies/privileged_information.py --inputs smell", "--inputs"),
     ("speed/steps.py ppo", "no algorithm 'ppo'"),
     # tasks and their demonstrations
     ("bgpo continual --tasks juggle", "'juggle'"),
@@ -93,7 +92,7 @@ CASES = [
     ("bgpo continual --algorithm.beta 0.2 --presett quick", "--presett"),
     ("bgpo continual --algorithm.beta -1", "beta must be at least 0"),
     ("bgpo continual --episodes 1.5", "--episodes"),
-    ("studies/privileged_information.py --rl.gamma 1.5", "gamma must be between 0 and 1"),
+    ("bgpo continual --algorithm.rl.gamma 1.5", "gamma must be between 0 and 1"),
     ("bgpo watch", "Run directory"),
     ("bgpo encoders empty --config.vae.batch-size 0", "batch_size must be at least"),
 ]
