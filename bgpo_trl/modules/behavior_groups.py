@@ -20,6 +20,9 @@ from bgpo_trl.modules.gwr import Numbers, as_tensor
 _KNOWN_SHARE = 0.99  # of a group's own demonstrations that are to count as known
 _FITTING_SHARE = 0.9  # of a group's own demonstrations whose starts are to count as fitting
 _ROUNDING = 1e-4  # of a vector's length; shipped demonstrations differ by 600 times as much
+# After the first ten to twenty demonstrations of a new task, which experts of other tasks solve in
+# 5 to 8 % of cases, four successes are rare.
+_SOLVED = 4
 # Of the state.
 _ARRAYS = ("points", "starts", "shown", "tried", "won", "group", "member", "cluster")
 _LISTS = ("parent", "links", "joined")
@@ -68,9 +71,10 @@ class BehaviorGroups:
        is the group with which it has most in common.
     4. Groups that turn out to be one behavior can be joined (`join`), and stay so: the clusters of
        their densest demonstrations are one group from then on. If such a group splits, a cluster
-       still belongs to it if the group's expert has succeeded after the cluster's demonstrations,
-       by the criteria of 7. The first demonstrations of a new task may be of this group too, but
-       its expert does not solve them.
+       belongs to it as long as the group's expert has succeeded four times after the cluster's
+       demonstrations, and does not fall short, by more than a standard deviation, of half its rate
+       after the others. The first demonstrations of a new task may be of this group too, but its
+       expert does not solve them.
 
     A task that looks different from different starts, such as a push to the left or to the right,
     forms several groups. The expert of each does not know what to do where the group's own
@@ -360,7 +364,6 @@ class BehaviorGroups:
     def _arrange(self) -> None:
         """Turn the clusters into groups, matched with the groups so far."""
         before = self.group
-        self._link_fragments()
         labels = np.full(len(self.points), -1)
         labels[: len(self.cluster)] = self._linked()
         common = np.zeros((labels.max() + 1, len(self.parent)), np.int64)
@@ -383,35 +386,30 @@ class BehaviorGroups:
         self.trials.keep(self.numbers)
 
     def _linked(self) -> NDArray[np.int64]:
-        """Return the clusters, of which linked ones have the same label."""
+        """Return the clusters, of which those that are one group have the same label."""
         labels, inside = self.cluster.copy(), np.flatnonzero(self.cluster >= 0)
         for link in self.links:
             ends, others = self._places(self.points[[*link]]), self._places(self.points[inside])
             nearest = cdist(ends, others).argmin(1)
             one, other = labels[inside[nearest]]
             labels[labels == other] = one
-        return labels
-
-    def _link_fragments(self) -> None:
-        """Link the clusters into which joined groups have split to the largest of each group."""
+        group = self.group[: len(labels)]
         for number in sorted({*self.joined}):
-            labels = self._linked()
-            of_group = (self.group[: len(labels)] == number) & (labels >= 0)
-            found, counts = np.unique(labels[of_group], return_counts=True)
-            parts = [
-                np.flatnonzero(labels == label)
-                for label in found[np.argsort(-counts, kind="stable")]
-            ]
-            for part in parts[1:]:
-                of_part = part[of_group[part]]
-                if 2 * len(of_part) > len(part) and self._solves(of_part, parts[0]):
-                    self.links.append((self._densest(part), self._densest(parts[0])))
+            found, counts = np.unique(labels[(group == number) & (labels >= 0)], return_counts=True)
+            largest, *parts = found[np.argsort(-counts, kind="stable")].tolist() or [-1]
+            for part in parts:
+                of_part = np.flatnonzero(labels == part)
+                known = of_part[group[of_part] == number]
+                others = np.flatnonzero(labels == largest)
+                if 2 * len(known) > len(of_part) and self._solves(known, others):
+                    labels[of_part] = largest
+        return labels
 
     def _solves(self, part: NDArray[np.int64], others: NDArray[np.int64]) -> bool:
         """Return whether a group's expert solves a part of its demonstrations like others."""
         rate = self.won[others].sum() / max(1, self.tried[others].sum())
         won, half = self.won[part].sum(), self.tried[part].sum() * rate / 2
-        return bool(won >= max(self.trials.successes, half - half**0.5))
+        return bool(won >= max(_SOLVED, half - half**0.5))
 
     def _measure(self) -> None:
         """Measure the reach of each group."""

@@ -179,8 +179,13 @@ def test_joined_groups_stay_joined_when_clustered_anew():
         assert len(groups.numbers) == n_groups
 
 
-@pytest.mark.parametrize(("solved", "n_groups"), [(True, 1), (False, 2)])
-def test_a_part_of_a_joined_group_parts_unless_the_groups_expert_solves_it(solved, n_groups):
+@pytest.mark.parametrize(
+    ("solved", "played", "n_groups"),
+    [(True, 1_000, 1), (False, 1_000, 2), (True, 8, 1), (True, 6, 2)],  # 8: four successes
+)
+def test_a_part_of_a_joined_group_parts_unless_the_groups_expert_solves_it(
+    solved, played, n_groups
+):
     """The first of two joined groups falls into halves in time, like a new task beside an old."""
     generator = torch.Generator().manual_seed(0)
 
@@ -191,14 +196,20 @@ def test_a_part_of_a_joined_group_parts_unless_the_groups_expert_solves_it(solve
 
     groups, plain = BehaviorGroups(1), BehaviorGroups(1)
 
+    n_upper = 0  # episodes of the upper half, of which the group's expert plays the first
+
     def play(inputs):
         """All of the group is solved every other time, the upper half perhaps never."""
+        nonlocal n_upper
         for number, phi in enumerate(inputs):
             group = int(groups.adapt(phi).group)
-            upper = 2.25 < float(phi) < 20
-            success = number % 4 < 2 and (solved or not upper)
-            groups.end(group, group, fits=True, success=success)
             plain.adapt(phi)
+            upper = 2.25 < float(phi) < 20
+            n_upper += upper
+            if upper and n_upper > played:
+                continue
+            success = n_upper % 2 == 0 and solved if upper else number % 4 < 2
+            groups.end(group, group, fits=True, success=success)
 
     play(torch.cat([draw(60, halves=4.5), draw(40, place=40.0)]))
     assert groups.numbers == plain.numbers == [0, 1]
