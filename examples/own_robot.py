@@ -122,7 +122,13 @@ if __name__ == "__main__":
         inverse=InverseModelConfig(steps=200),
     )
     encoders, bank = train_encoders(
-        dataset, None, OUT / "encoders.safetensors", OUT / "encoders", small, scene=RAIL
+        dataset,
+        None,
+        OUT / "encoders.safetensors",
+        OUT / "encoders",
+        small,
+        tasks=TASKS,
+        scene=RAIL,
     )
     config = RunConfig(
         scene="rail",

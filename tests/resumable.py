@@ -50,4 +50,5 @@ def train_small_encoders(directory):
     with pytest.MonkeyPatch.context() as patch:
         short = partial(probes.perceptron_predict, steps=50)
         patch.setattr(probes, "perceptron_predict", short)
-        train_encoders(dataset, None, weights, directory / "log", ENCODERS, **options)
+        tasks = NICO.default_tasks
+        train_encoders(dataset, None, weights, directory / "log", ENCODERS, tasks=tasks, **options)

@@ -72,9 +72,17 @@ class DemonstrationSteps:
             action: Actions in [-1, 1], ``[N, T - 1, A]``.
             length: Number of frames to keep of each, int64 ``[N]``.
             joints: Readings of the robot's joints, float32 ``[N, T, J]``, or None.
+
+        Raises:
+            ValueError: If a latent or an action is NaN or Inf.
         """
         valid = torch.arange(latent.shape[1]) < length.unsqueeze(-1)
         padded = torch.nn.functional.pad(action, (0, 0, 0, 1))
+        if not (latent[valid].isfinite().all() and padded[valid].isfinite().all()):
+            raise ValueError(
+                "latents or actions of demonstrations are not finite: look for frames or actions "
+                "that are not, or train the encoders again"
+            )
         return cls(
             (latent[valid] * _LATENT_CODES).round().clamp(-127, 127).to(torch.int8),
             (padded[valid] * _ACTION_CODES).round().clamp(-127, 127).to(torch.int8),

@@ -6,6 +6,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Mapping, Sequence
+from operator import index
 from pathlib import Path
 from typing import Any
 
@@ -265,7 +266,8 @@ def write_demonstrations(
     scene.check_spread(spread)
     chosen = list(episodes) if tasks is None else list(tasks)
     scene.check_tasks(chosen)
-    settings = {"held_out_per_task": held_out_per_task, "spread": float(spread)}
+    # NumPy's integers cannot be written as JSON.
+    settings = {"held_out_per_task": index(held_out_per_task), "spread": float(spread)}
     return _write(Path(path), scene, {task: episodes.get(task, ()) for task in chosen}, settings)
 
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import io
+import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageOps
 
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp")
 
@@ -19,13 +22,13 @@ class UnreadableError(ValueError):
 
 
 def decode_image(content: bytes) -> NDArray[np.uint8]:
-    """Return an image of 8 bits a color as ``[H, W, 3]``, red first.
+    """Return an image of 8 bits a color as ``[H, W, 3]``, red first, upright as its camera says.
 
     Raises:
         UnreadableError: If it is transparent or of more than 8 bits.
         OSError, SyntaxError: If it is damaged, from Pillow.
     """
-    image = Image.open(io.BytesIO(content))
+    image = ImageOps.exif_transpose(Image.open(io.BytesIO(content)))
     sixteen = content.startswith(b"\x89PNG") and content[24] > 8  # Pillow drops half of them
     if sixteen or image.mode not in ("1", "L", "P", "RGB", "LA", "RGBA"):
         raise UnreadableError(
@@ -48,11 +51,11 @@ def check_depth(stream: Any) -> None:
         raise UnreadableError(f"its frames are {name}, of more than 8 bits, as of a depth map")
 
 
-def read_film(path: Path) -> NDArray[np.uint8]:
-    """Return the frames of a film, or of a folder of images in the order of their names.
+def read_film(path: Path) -> Iterator[NDArray[np.uint8]]:
+    """Yield the frames of a film, or of a folder of images in the order of their names and numbers.
 
-    Returns:
-        uint8 ``[T, H, W, 3]``, red first.
+    Yields:
+        uint8 ``[H, W, 3]``, red first.
 
     Raises:
         UnreadableError: If there is no such film, PyAV is missing, or frames cannot be read, are
@@ -60,27 +63,48 @@ def read_film(path: Path) -> NDArray[np.uint8]:
     """
     if not path.exists():
         raise UnreadableError(f"there is no {path}: name a film, or a folder of images")
-    frames, file = list[NDArray[np.uint8]](), path
+    shape = None
+    for frame in _images_in(path) if path.is_dir() else _decoded(path):
+        if shape not in (None, frame.shape):
+            raise UnreadableError(f"the frames in {path} differ in size: make them alike")
+        shape = frame.shape
+        yield frame
+    if shape is None:
+        raise UnreadableError(f"{path} has no frames: name a film, or a folder of images")
+
+
+def _images_in(folder: Path) -> Iterator[NDArray[np.uint8]]:
+    images = (file for file in folder.iterdir() if file.suffix.lower() in _IMAGES)
+    for file in sorted(images, key=_with_numbers):
+        with _decoding(file):
+            yield decode_image(file.read_bytes())
+
+
+def _decoded(file: Path) -> Iterator[NDArray[np.uint8]]:
+    with _decoding(file), importlib.import_module("av").open(str(file)) as film:
+        check_depth(film.streams.video[0])
+        for frame in film.decode(video=0):
+            yield frame.to_ndarray(format="rgb24")
+
+
+@contextlib.contextmanager
+def _decoding(file: Path) -> Iterator[None]:
+    """Turn whatever goes wrong with a file into one line."""
     try:
-        if path.is_dir():
-            for file in sorted(p for p in path.iterdir() if p.suffix.lower() in _IMAGES):
-                frames.append(decode_image(file.read_bytes()))
-        else:
-            with importlib.import_module("av").open(str(path)) as film:
-                check_depth(film.streams.video[0])
-                frames += [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+        yield
     except UnreadableError as error:
         raise UnreadableError(f"{file}: {error}") from None
     except ImportError:
         raise UnreadableError(
-            f"{path} is a film: pip install av (PyAV) to decode it, or name a folder of its frames"
+            f"{file} is a film: pip install av (PyAV) to decode it, or name a folder of its frames"
         ) from None
     except (OSError, SyntaxError, ValueError, IndexError) as error:  # of Pillow and PyAV
         raise UnreadableError(
             f"{file} cannot be decoded: name a film, or a folder of its frames as PNG"
         ) from error
-    if not frames:
-        raise UnreadableError(f"{path} has no frames: name a film, or a folder of images")
-    if len({frame.shape for frame in frames}) > 1:
-        raise UnreadableError(f"the frames in {path} differ in size: make them alike")
-    return np.stack(frames)
+
+
+def _with_numbers(file: Path) -> list[tuple[int, str]]:
+    """Return a key that sorts names with their numbers as numbers: 2.png before 10.png."""
+    parts = re.split(r"(\d+)", file.name)
+    return [(int(part), part) if part.isdecimal() else (-1, part) for part in parts]

@@ -98,10 +98,11 @@ def read_lerobot(
         )
     reader = _Reader(Path(path), image_key, frame_shape)
     reader.check_numeric(chosen)
-    if logged and success_key not in reader.features:
+    may_lack = () if logged else (None, "next.success")
+    if success_key not in (*reader.features, *may_lack):
         raise ValueError(
-            f"{path} has no {success_key!r}, by which logged episodes say whether they succeeded: "
-            f"give one of its features as success_key, {', '.join(reader.features)}"
+            f"{path} has no {success_key!r}, by which episodes say whether they succeeded: give "
+            f"one of its features as success_key, {', '.join(reader.features)}"
         )
     found = reader.read(chosen, success_key, episodes, tasks, stride, logged)
     if "action" in chosen and stride > 1 and combine is not None:
@@ -145,6 +146,7 @@ class _Reader:
             self.features = {name: str(f["dtype"]) for name, f in info["features"].items()}
             depth = {name for name, f in info["features"].items() if _is_depth(f)}
             self.n_episodes = int(info["total_episodes"])
+            self.n_frames = int(info["total_frames"])
         if not version.startswith("v3."):
             raise ValueError(
                 f"{path} has version {version}, not 3: convert it with LeRobot's "
@@ -168,6 +170,7 @@ class _Reader:
         self.path, self.image_key, self.frame_shape = path, image_key, frame_shape
         self.is_video = self.features[image_key] == "video"
         self._images: tuple[Path | None, Sequence[Any]] = (None, [])
+        self._film_ends: dict[tuple[int, int], float] = {}  # s, by chunk and file
         if self.is_video and importlib.util.find_spec("av") is None:
             raise ValueError(
                 f"{path} has its frames as video: pip install av (PyAV) to decode them, or decode "
@@ -231,7 +234,7 @@ class _Reader:
             name = names[labels.pop()]
             if name not in found or (episodes is not None and number not in episodes):
                 continue
-            succeeded = not success or bool(_scalars(own[success[0]]).any())
+            succeeded = not success or self._succeeded(number, own[success[0]])
             if not (succeeded or logged):
                 failed.append(number)
             elif not failed:
@@ -244,6 +247,17 @@ class _Reader:
                 "name the others as episodes=..., or read all with success_key=None"
             )
         return found
+
+    def _succeeded(self, number: int, column: pd.Series) -> bool:
+        """Return whether a frame of an episode says that it succeeded."""
+        flags = [np.asarray(cell).item() for cell in column]
+        other = [flag for flag in flags if flag is not None and flag not in (0, 1)]
+        if other:
+            raise ValueError(
+                f"episode {number} of {self.path} has the success {other[0]!r}, which is neither "
+                "true nor false: give another feature as success_key, or None if there is none"
+            )
+        return any(flags)
 
     def _task_names(self) -> dict[int, str]:
         """Return the descriptions of the tasks, by index."""
@@ -275,7 +289,26 @@ class _Reader:
                 f"{self.path} has {self.n_episodes} episodes by meta/info.json, {len(described)} "
                 f"by meta/episodes and {len(recorded)} by data{which}: get it again whole"
             )
+        if int(metadata["length"].sum()) != self.n_frames:
+            raise ValueError(
+                f"{self.path} has {self.n_frames} frames by meta/info.json, "
+                f"{int(metadata['length'].sum())} by meta/episodes: get it again whole"
+            )
+        if self.is_video:
+            self._place_in_films(metadata)
         return metadata
+
+    def _place_in_films(self, metadata: pd.DataFrame) -> None:
+        """Note where the last episode of each film ends; refuse episodes that overlap."""
+        half = 0.5 / self.fps
+        placed = metadata.sort_values([*metadata.columns[2:]])
+        for number, length, chunk, file, start in placed.itertuples(index=False):
+            if start < self._film_ends.get((chunk, file), 0.0) - half:
+                raise ValueError(
+                    f"episode {number} of {self.path} begins in another one's frames, at "
+                    f"{start:.3f} s of its film by meta/episodes: get it again whole"
+                )
+            self._film_ends[chunk, file] = start + length / self.fps
 
     def _table(self, folder: str, columns: list[str]) -> pd.DataFrame:
         """Return columns of all Parquet files of a folder, with ``file`` and ``row`` in it."""
@@ -329,13 +362,21 @@ class _Reader:
             with _reading(video):
                 if not video.is_file():
                     raise FileNotFoundError
-                yield from _frames_at(video, start + times, 0.5 / self.fps)
+                end = self._film_ends[chunk, file]
+                yield from _frames_at(video, start + times, 0.5 / self.fps, end)
             return
+        shape = None
         for file, row in zip(rows["file"], rows["row"], strict=True):
             if self._images[0] != file:
                 column = pq.ParquetFile(file).read([self.image_key]).column(0).to_pylist()
                 self._images = file, column
-            yield decode_image(self._image(self._images[1][row]))
+            frame = decode_image(self._image(self._images[1][row]))
+            if shape not in (None, frame.shape):
+                raise UnreadableError(
+                    f"its images differ in size, {[*shape]} and {[*frame.shape]}: make them alike"
+                )
+            shape = frame.shape
+            yield frame
 
     def _image(self, image: Mapping[str, Any]) -> bytes:
         """Return the content of an image, which is in its row or in a file of the dataset."""
@@ -367,17 +408,26 @@ def _some(values: Sequence[Any]) -> str:
 
 
 def _frames_at(
-    path: Path, times: NDArray[np.float64], tolerance: float
+    path: Path, times: NDArray[np.float64], tolerance: float, end: float
 ) -> Iterator[NDArray[np.uint8]]:
     """Decode the frames of a video that are nearest to some times (s), which ascend.
 
     Raises:
-        ValueError: If the nearest frame is farther than the tolerance.
+        ValueError: If the nearest frame is farther than the tolerance, or the video ends before
+            ``end`` (s).
     """
     av = importlib.import_module("av")
     with av.open(str(path)) as video:
         stream = video.streams.video[0]
         check_depth(stream)
+        ticks, first = (getattr(stream, name, None) for name in ("duration", "start_time"))
+        seconds = float(((first or 0) + (ticks or 0)) * stream.time_base)
+        if ticks and seconds < end - tolerance:  # some formats do not say how long they are
+            raise UnreadableError(
+                f"it ends at {seconds:.3f} s, its last episode at {end:.3f} s: a frame was never "
+                "encoded, and those after it would be taken for those before; get or record it "
+                "again"
+            )
         start = max(0, int((times[0] - tolerance) / stream.time_base))
         video.seek(start, stream=stream)  # to the keyframe before
         frames = video.decode(stream)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from operator import index
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,8 @@ def record_demonstrations(
         RuntimeError: If there is no OpenGL to render with, or a demonstrator fails too often;
             earlier rows are kept.
     """
+    # NumPy's integers cannot be written as JSON; fractions are refused.
+    per_task, held_out_per_task, seed = map(index, (per_task, held_out_per_task, seed))
     scene = find_scene(scene)
     tasks = scene.default_tasks if tasks is None else tasks
     scene.check_tasks(tasks)
@@ -186,7 +189,7 @@ class _Recorder:
         frames, numbers, actions = [checked_frame(simulation, shape)], [self._numbers()], []
         success = False
         for _ in range(scene.max_steps):
-            action = act()
+            action = np.array(act())  # a copy, since a policy may use its array again
             if not np.isfinite(action).all():  # what a simulation makes of it is its own
                 raise ValueError(
                     f"an episode of the demonstrator of {task!r} has an action that is not finite"

@@ -119,6 +119,7 @@ def retrain_inverse(
     play: TensorDictBase,
     config: RepresentationConfig | None = None,
     *,
+    shown: TensorDictBase | None = None,
     command: str = "",
     **how: Any,
 ) -> Representation:
@@ -126,14 +127,15 @@ def retrain_inverse(
 
     What limits the inverse model is the amount of play (docs/learning.md), which costs little to
     record, whereas the other encoders would take longer to train on it. Of ``config``, the seed,
-    the intervals and ``inverse`` are used. Other arguments, the result and errors are as for
-    `train_representation`; play without actions is refused, too.
+    the intervals and ``inverse`` are used. ``shown``, if given, are the demonstrations whose
+    actions it is to infer, checked as by `train_representation`. Other arguments, the result and
+    errors are as for `train_representation`; play without actions is refused, too.
     """
     fit = Fit(config or RepresentationConfig(), **how)
     own = training_part(play, "the recorded play")
     if "action" not in own:
         raise ValueError("the inverse model learns from actions, which this play lacks: record it")
-    _check_actions(None, own, fit.config.inverse)
+    _check_actions(shown, own, fit.config.inverse)
     network = representation.frame_network.to(fit.device)
     inverse = _train_inverse(encode_frames(network, own), own, fit)
     metadata = representation.metadata
@@ -362,7 +364,8 @@ def _check_actions(
             raise ValueError(
                 f"largest_action {config.largest_action} leaves {left_out:.0%} of the actions out, "
                 f"most by component {component}, and the inverse model would never see them: raise "
-                "it (--config.inverse.largest-action, or largest_action of the scene), 1 keeps all"
+                "it (`bgpo encoders --config.inverse.largest-action`, or largest_action of the "
+                "scene), 1 keeps all"
             )
 
 

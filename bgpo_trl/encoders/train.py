@@ -38,13 +38,14 @@ def train_encoders(
     weights: Path,
     folder: Path,
     config: RepresentationConfig,
+    *,
+    tasks: Sequence[str],
+    scene: Scene | str,
     command: str = "",
     device: torch.device | str = "cpu",
     progress: bool = True,
-    tasks: Sequence[str] | None = None,
     spread: float = 1.0,
     keep: Representation | None = None,
-    scene: Scene | str = "nico",
 ) -> tuple[Representation, DemonstrationBank]:
     """Train, save and probe both encoders, and embed the demonstrations with them.
 
@@ -58,13 +59,13 @@ def train_encoders(
         folder: Folder for ``train.csv``, ``checkpoint/``, ``probes.json`` and
             ``reconstructions.png``.
         config: Hyperparameters.
+        tasks: Task names, in the order of their labels.
+        scene: The robot, or its name.
         command: Command line, stored with the weights.
         device: Device to train on.
         progress: Whether to show progress bars.
-        tasks: Task names, in the order of their labels; by default the scene's.
         spread: Share of the range of start states of the recordings.
         keep: Encoders of which only the inverse model is trained anew, on play.
-        scene: The robot, or its name.
 
     Raises:
         ValueError: As `train_representation`; if there are encoders to keep, but no play; or if
@@ -74,7 +75,6 @@ def train_encoders(
     if keep is not None and play is None:
         raise ValueError("to train the inverse model alone, give the folder of recorded play")
     scene = find_scene(scene)
-    tasks = scene.default_tasks if tasks is None else tasks
     if play is not None and keep is None and scene.state is not None and "state" in play:
         split(play, "the recorded play")  # before hours of training, at whose end it is probed
     if config.inverse.largest_action is None:
@@ -86,7 +86,7 @@ def train_encoders(
         how: dict[str, Any] = {"command": command, "checkpoint": folder / "checkpoint"}
         how |= {"log": _log_of(file), "progress": progress, "device": device}
         if keep is not None and play is not None:
-            representation = retrain_inverse(keep, play, config, **how)
+            representation = retrain_inverse(keep, play, config, shown=dataset, **how)
         else:
             how |= {"scene": scene.identity, "spread": spread}
             representation = train_representation(dataset, config, play=play, **how)
@@ -153,6 +153,8 @@ def make_pretrained(
     per_task: int = 1_200,
     held_out_per_task: int = 200,
     seed: int = 0,
+    tasks: Sequence[str] | None = None,
+    scene: Scene | str = "nico",
     command: str = "",
     device: torch.device | str = "cpu",
     **shared: Any,
@@ -170,14 +172,17 @@ def make_pretrained(
         per_task: Demonstrations of each task.
         held_out_per_task: How many of those are held out.
         seed: Seed of the recording.
+        tasks: Names of the tasks; by default the scene's.
+        scene: The robot, or its name.
         command: Command line, stored with the weights.
         device: Device to train on.
-        **shared: ``scene``, ``tasks``, ``spread`` and ``progress``, as for `record_demonstrations`
-            and `train_encoders`.
+        **shared: ``spread`` and ``progress``, as for `record_demonstrations` and `train_encoders`.
 
     Raises:
         ValueError: If the dataset is damaged or was recorded in another scene.
     """
+    scene = find_scene(scene)
+    shared |= {"scene": scene, "tasks": scene.default_tasks if tasks is None else tuple(tasks)}
     record = partial(record_demonstrations, seed=seed, **shared)
     demonstrations = record(dataset, per_task=per_task, held_out_per_task=held_out_per_task)
     play = record(

@@ -39,12 +39,12 @@ def encoders(arguments: EncodersArguments) -> None:
         arguments.folder / "encoders.safetensors" if weights is None else weights,
         arguments.folder,
         arguments.config,
-        command(),
-        choose_device(arguments.device),
         tasks=meta["tasks"],
+        scene=scene,
+        command=command(),
+        device=choose_device(arguments.device),
         spread=meta["spread"],
         keep=None if keep is None else load_representation(keep, scene=scene),
-        scene=scene,
     )
 
 

@@ -170,9 +170,11 @@ def watch(arguments: WatchArguments) -> str:
 def one_shot(arguments: OneShotArguments) -> str:
     """Show a policy a demonstration; return what it recognizes and, if asked for, achieves."""
     policy = load_run(arguments.run, seed=arguments.run_seed)
-    film = read_film(arguments.demonstration)
-    frames = policy.preprocess(film, color="rgb", crop=arguments.crop)
-    lines = [f"{len(frames)} frames of {film.shape[1]} x {film.shape[2]}"]
+    seen, size = list[NDArray[np.uint8]](), ""
+    for frame in read_film(arguments.demonstration):  # one at a time, as a film is large
+        seen.append(policy.preprocess(frame, color="rgb", crop=arguments.crop))
+        size = f"{frame.shape[0]} x {frame.shape[1]}"
+    frames, lines = np.stack(seen), [f"{len(seen)} frames of {size}"]
     lines += _recognized(policy.condition(frames, task=arguments.task))
     if arguments.task is None:
         return "\n".join([*lines, "--task NAME plays it in the simulation"])

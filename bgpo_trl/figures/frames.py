@@ -17,15 +17,15 @@ from bgpo_trl.files.writing import make_folder, write_whole
 
 
 def file_names(tasks: Sequence[str]) -> list[str]:
-    """Return a name for a file of each task: its own, of which no sign or length is a problem.
+    """Return a name for a file of each task: its own, if no sign or length of it is a problem.
 
     Examples:
         >>> file_names(["grasp_glass", "put a/b, then c", "put a/b: then c"])
-        ['grasp_glass', 'put_a_b_then_c-1', 'put_a_b_then_c-2']
+        ['grasp_glass', 'put_a_b_then_c.1', 'put_a_b_then_c.2']
     """
     plain = [re.sub(r"[^\w-]+", "_", name)[:60] for name in tasks]
     return [
-        name if name == short else f"{short}-{number}"
+        name if name == short else f"{short}.{number}"  # no task's own name, which has no dot
         for number, (name, short) in enumerate(zip(tasks, plain, strict=True))
     ]
 

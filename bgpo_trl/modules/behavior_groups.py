@@ -232,7 +232,7 @@ class BehaviorGroups:
         if (pair := self.trials.same_task()) is not None:
             self.join(*pair)
 
-    def adapt(self, phi: Numbers, start: Tensor | None = None) -> GroupMatch:
+    def adapt(self, phi: Numbers, start: Numbers | None = None) -> GroupMatch:
         """Find the group of one demonstration and learn from it.
 
         Args:
@@ -243,12 +243,17 @@ class BehaviorGroups:
             The match ``[]`` from before learning.
 
         Raises:
-            ValueError: As from `lookup`, or if starts differ in size; nothing has changed then.
+            ValueError: As from `lookup`, or if starts differ in size or are not finite; nothing has
+                changed then.
         """
         phi = as_tensor(phi, "phi")
         if phi.ndim != 1:
             raise ValueError(f"phi must be [{self.n_features}], got {[*phi.shape]}")
-        first = np.empty(0, np.float32) if start is None else start.cpu().numpy()
+        first = np.empty(0, np.float32)
+        if start is not None:
+            first = as_tensor(start, "start").cpu().numpy().astype(np.float32)
+        if not np.isfinite(first).all():
+            raise ValueError(f"start must be finite numbers, got {first.tolist()}")
         if len(self.points) and first.shape != self.starts.shape[1:]:
             raise ValueError(
                 f"the starts of earlier demonstrations have {self.starts.shape[1]} features, this "

@@ -288,7 +288,17 @@ class DDPGLoss(LossModule):
         }
 
     def target(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the clipped bootstrapped targets of transitions, ``[*S, *B]``."""
+        """Return the clipped bootstrapped targets of transitions, ``[*S, *B]``.
+
+        Raises:
+            ValueError: If the reward has another shape, or transitions are of TorchRL's
+                ``MultiStep``.
+        """
+        if "nonterminal" in tensordict:  # which MultiStep writes
+            raise ValueError(
+                "TorchRL's MultiStep leaves 'terminated' of the first step, by which targets would "
+                "be wrong: make transitions of several steps with GroupReplay(n_steps=...)"
+            )
         next_value = self.next_value(self.following(tensordict)).unsqueeze(-1)
         reward = tensordict.get(("next", self.tensor_keys.reward))
         if reward.shape != next_value.shape:

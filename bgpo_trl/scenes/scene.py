@@ -90,12 +90,14 @@ class Simulation(ABC):
 
 
 def checked_frame(simulation: Simulation, frame_shape: Sequence[int]) -> NDArray[np.uint8]:
-    """Return a simulation's frame; NumPy would convert others, and fractions would become black.
+    """Return a copy of a simulation's frame, whose array it may use again.
+
+    NumPy would convert others, and fractions would become black.
 
     Raises:
         ValueError: If it is not uint8 ``[H, W, 3]`` of the height and width given.
     """
-    frame, shape = np.asarray(simulation.frame()), (*frame_shape, 3)
+    frame, shape = np.array(simulation.frame()), (*frame_shape, 3)
     if frame.dtype != np.uint8 or frame.shape != shape:
         wanted = f"uint8 {[*shape]}, as the scene's frame_shape says"
         raise _refusal(simulation, "frame", f"{frame.dtype} {[*frame.shape]}", wanted)
@@ -129,7 +131,7 @@ def checked_step(simulation: Simulation, action: NDArray[np.float64]) -> Outcome
             each step), or the executed action something else than finite numbers in [-1, 1], as
             many as asked for.
     """
-    outcome = simulation.step(action)
+    outcome = simulation.step(action.copy())  # which it may change in place
     flags = outcome[:2] if isinstance(outcome, Outcome) else (None,)
     if not all(type(flag) in (bool, np.bool_) for flag in flags):
         wanted = "an Outcome, whose success and failure are True or False"

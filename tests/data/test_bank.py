@@ -53,6 +53,21 @@ def test_no_number_is_off_by_more_than_half_a_code(steps, padded):
     assert latent.abs().max() > 5.08  # so that some are clipped
 
 
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_latents_and_actions_are_finite(padded, value):
+    """Rounded to whole numbers, NaN would be 0."""
+    for part in padded:
+        for row, moment, kept in ((3, 5, True), (1, 0, False)):  # of 6 frames and of none
+            changed = [entry.clone() for entry in padded]
+            at = next(i for i, entry in enumerate(padded) if entry is part)
+            changed[at][row, min(moment, part.shape[1] - 1), 0] = value
+            if not kept:
+                DemonstrationSteps.of(*changed, LENGTH)
+                continue
+            with pytest.raises(ValueError, match="latents or actions of demonstrations are not"):
+                DemonstrationSteps.of(*changed, LENGTH)
+
+
 def test_some_demonstrations_are_those_of_the_rows_one_after_the_other(steps):
     both = steps.select(torch.tensor([3])) + steps.select(torch.tensor([2, 1, 0]))
     assert both.length.tolist() == [6, 2, 0, 4]

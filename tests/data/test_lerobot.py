@@ -7,6 +7,7 @@ import shutil
 import sys
 from contextlib import nullcontext
 from fractions import Fraction
+from functools import partial
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -159,6 +160,10 @@ def replaced(column, values):
     return lambda path: edit_rows(path, lambda rows: rows.assign(**{column: values}))
 
 
+def png(width):
+    return saved(Image.new("RGB", (width, 8)))
+
+
 INFO, TASK_FILE = "meta/info.json", "meta/tasks.parquet"
 IMAGE = {"dtype": "image", "shape": [32, 64, 3], "names": None}
 
@@ -174,6 +179,7 @@ IMAGE = {"dtype": "image", "shape": [32, 64, 3], "names": None}
             "get it again",
         ),
         (edit_info(total_episodes=4), "has 4 episodes by meta/info.json, 3 by", "get it again"),
+        (edit_info(total_frames=12), "12 frames by meta/info.json, 11 by meta", "get it again"),
         (
             replaced("timestamp", [0, 0.2, 0.6, 0.8, 1, 0, 0.2, 0, 0.2, 0.4, 0.6]),
             "frame 2 is at 0.600 s instead of 0.400 s",
@@ -196,6 +202,11 @@ IMAGE = {"dtype": "image", "shape": [32, 64, 3], "names": None}
             "frame_index",
         ),
         (replaced(CAMERA, [{"bytes": b"PNG"}] * 11), "episode 0", "is damaged"),
+        (
+            lambda p: replaced(CAMERA, [{"bytes": png(width)} for width in range(1, 12)])(p),
+            "episode 0",
+            "differ in size, [8, 1, 3] and [8, 2, 3]: make them alike",
+        ),
         (lambda p: (p / INFO).write_text("[]"), "info.json", "is damaged"),
         (lambda p: (p / INFO).unlink(), "info.json", "give the folder of a whole"),
         (lambda p: shutil.rmtree(p / "data"), "data is missing", "give the folder of a whole"),
@@ -220,6 +231,7 @@ def test_unknown_features_are_refused(written, refused, monkeypatch):
         ({"tasks": ["wipe"]}, "no task 'wipe': choose among grasp_glass"),
         ({"stride": 2}, "say how actions become one"),
         ({"stride": 0}, "stride 0"),
+        ({"success_key": "next.sucess"}, "no 'next.sucess', by which .*: give one of its features"),
     ):
         with pytest.raises(ValueError, match=cause):
             read_lerobot(written, **wrong)
@@ -243,6 +255,17 @@ def test_failed_episodes_are_no_demonstrations_unless_asked_for(written, refused
     found = [[one["success"] for one in logged[task]] for task in TASKS]
     assert found == [[False], [True, False]]
     write_logged_episodes(written.parent / "log", logged, scene="nico")
+
+
+@pytest.mark.parametrize("value", [np.nan, -0.5, 2])
+def test_numbers_that_are_no_success_are_refused(written, refused, value):
+    """A reward, or NaN, is true to Python."""
+    features = json.loads((written / INFO).read_text())["features"]
+    edit_info(features={**features, "next.success": {"dtype": "float32", "shape": [1]}})(written)
+    replaced("next.success", [0.0, value] + [1.0] * 9)(written)
+    for logged in (False, True):
+        call = partial(read_lerobot, written, logged=logged)
+        refused(call, f"has the success {float(value)}, which is neither", "success_key")
 
 
 def test_logged_episodes_without_success_are_refused(written, refused):
@@ -373,7 +396,12 @@ class StandIn(ModuleType):
         super().__init__("av")
         self.__spec__ = ModuleSpec("av", None)
         self.kept = [*kept]
-        stream = SimpleNamespace(format=SimpleNamespace(name=pix_fmt), time_base=Fraction(1, 5))
+        stream = SimpleNamespace(
+            format=SimpleNamespace(name=pix_fmt),
+            time_base=Fraction(1, 5),
+            start_time=0,
+            duration=self.kept[-1] + 1,
+        )
         self.streams = SimpleNamespace(video=[stream])
 
     def open(self, file):
@@ -427,13 +455,25 @@ def test_frames_of_a_video_are_decoded_from_the_first_of_the_episode(written, fi
 
 
 @pytest.mark.parametrize(
-    ("gap", "episode", "time"), [(2, 0, "0.400"), (5, 1, "1.000"), (10, 2, "2.000")]
+    ("gap", "episode", "cause"),
+    [
+        (2, 0, "there is no frame at 0.400 s"),
+        (5, 1, "there is no frame at 1.000 s"),
+        (10, 0, "it ends at 2.000 s, its last episode at 2.200 s"),
+    ],
 )
-def test_a_video_that_lacks_a_frame_is_refused(written, film, refused, gap, episode, time):
+def test_a_video_that_lacks_a_frame_is_refused(written, film, refused, gap, episode, cause):
     """Read one after the other, all later frames would be off by one against the actions."""
     film([number for number in range(11) if number != gap])
-    cause = f"there is no frame at {time} s"
     refused(lambda: read_lerobot(written), f"episode {episode} of ", cause)
+
+
+def test_episodes_that_overlap_in_a_video_are_refused(written, film, refused):
+    film()
+    start = f"videos/{CAMERA}/from_timestamp"
+    edit_rows(written, lambda rows: rows.assign(**{start: (0.0, 0.8, 1.4)}), EPISODES)
+    cause = "begins in another one's frames, at 0.800 s"
+    refused(lambda: read_lerobot(written, episodes=[0]), cause, "get it again")
 
 
 def test_a_video_of_numbers_of_sixteen_bits_is_refused(written, film):

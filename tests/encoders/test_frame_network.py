@@ -93,7 +93,7 @@ def test_it_stays_as_it_is_and_its_latents_are_standardized():
 
 
 def test_what_is_of_the_vae_alone_is_left_out(tmp_path):
-    options = {"scene": DOT, "progress": False}
+    options = {"tasks": DOT.default_tasks, "scene": DOT, "progress": False}
     with pytest.warns(UserWarning) as caught:  # of the other encoders
         train_encoders(movies(), None, tmp_path / "weights", tmp_path, TINY, **options)
     assert not any("reconstruct" in str(warning.message) for warning in caught)

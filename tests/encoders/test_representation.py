@@ -32,6 +32,8 @@ from bgpo_trl.scenes.nico import NICO
 from tests.helpers import TINY_ENCODERS
 from tests.scenes.dot import scene
 
+TASKS = NICO.default_tasks
+
 CONFIG = RepresentationConfig(
     vae=VAEConfig(
         batch_size=16,
@@ -164,9 +166,9 @@ def test_play_is_held_out_only_where_it_is_probed(tmp_path: Path) -> None:
     play["train"] = torch.ones(10, dtype=torch.bool)
     arguments = (squares(8), play, tmp_path / "weights.safetensors", tmp_path / "run", TINY)
     with pytest.raises(ValueError, match=r"recorded play has no held-out .* held_out_per_task of"):
-        train_encoders(*arguments)
+        train_encoders(*arguments, tasks=TASKS, scene=NICO)
     assert not [*tmp_path.iterdir()]  # nothing was trained before
-    trained, _ = train_encoders(*arguments, scene=blind)
+    trained, _ = train_encoders(*arguments, tasks=TASKS, scene=blind)
     together = torch.cat([valid_frames(squares(8)[squares(8)["train"]]), valid_frames(play)])
     torch.testing.assert_close(trained.frame_network.mean_frame, mean_frame(together))
     play["train"] = torch.zeros(10, dtype=torch.bool)
@@ -196,12 +198,16 @@ def test_the_inverse_model_alone_is_trained_as_with_the_other_encoders(tmp_path:
     assert with_more.metadata == {**trained.metadata, **changes}
 
     weights = tmp_path / "weights.safetensors"
-    again = partial(train_encoders, squares(8), weights=weights, config=wider, keep=trained)
-    written, _ = again(more, folder=tmp_path / "more")
+    of_nico = {"tasks": TASKS, "scene": NICO}
+    again = partial(train_encoders, weights=weights, config=wider, keep=trained, **of_nico)
+    written, _ = again(squares(8), more, folder=tmp_path / "more")
     assert same(written, with_more) and same(load_representation(weights), with_more)
     with pytest.raises(ValueError, match="give the folder of recorded play"):
-        again(None, folder=tmp_path / "nothing")
+        again(squares(8), None, folder=tmp_path / "nothing")
+    limited = replace(wider, inverse=replace(wider.inverse, largest_action=0.6))
     assert not (tmp_path / "nothing").exists()
+    with pytest.raises(ValueError, match=r"largest_action 0\.6 leaves 100% of the actions out"):
+        again(with_a_gripper(8), more, config=limited, folder=tmp_path / "bold")
 
 
 def test_training_writes_weights_log_and_probes(tmp_path: Path) -> None:
@@ -209,7 +215,9 @@ def test_training_writes_weights_log_and_probes(tmp_path: Path) -> None:
     play = squares(10)
     play["state"][..., 7:] = 1.0  # on the table
     with pytest.warns(UserWarning) as caught:
-        trained, _ = train_encoders(squares(8), play, weights, folder, TINY, "make weights")
+        trained, _ = train_encoders(
+            squares(8), play, weights, folder, TINY, tasks=TASKS, scene=NICO, command="make weights"
+        )
     said = "".join(str(warning.message) for warning in caught)
     assert "of what moves in frames: look for the objects in recon" in said
     assert "actions inferred from frames have an R2 of" in said  # NICO's bank has these

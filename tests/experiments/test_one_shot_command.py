@@ -41,16 +41,26 @@ def test_it_prints_what_the_policy_infers_and_plays_a_task(run_of, film):
 
 
 def test_frames_are_read_exactly_in_the_order_of_names(film):
-    np.testing.assert_array_equal(read_film(film), FRAMES)
+    np.testing.assert_array_equal([*read_film(film)], FRAMES)
+    for number in range(len(FRAMES)):
+        (film / f"{number:04}.png").rename(film / f"frame {number}.png")
+    np.testing.assert_array_equal([*read_film(film)], FRAMES)  # 10 after 9, not after 1
+
+
+def test_images_are_upright_as_their_camera_says(tmp_path):
+    image, exif = Image.fromarray(FRAMES[0]), Image.Exif()
+    exif[0x0112] = 6  # to be turned by a quarter, clockwise
+    image.save(tmp_path / "0.png", exif=exif)
+    np.testing.assert_array_equal([*read_film(tmp_path)], [np.rot90(FRAMES[0], -1)])
 
 
 def test_what_cannot_be_read_is_refused_in_one_line(film, tmp_path, refused):
     (tmp_path / "empty").mkdir()
-    refused(lambda: read_film(tmp_path / "empty"), "has no frames", "name a film")
-    refused(lambda: read_film(tmp_path / "none.mp4"), "there is no", "name a film")
+    refused(lambda: [*read_film(tmp_path / "empty")], "has no frames", "name a film")
+    refused(lambda: [*read_film(tmp_path / "none.mp4")], "there is no", "name a film")
     text = tmp_path / "text.mp4"
     text.write_text("no film")
-    refused(lambda: read_film(text), str(text), "a folder of its frames")
+    refused(lambda: [*read_film(text)], str(text), "a folder of its frames")
     deep, clear = np.zeros((64, 128), np.uint16), np.zeros((64, 128, 4), np.uint8)
     for name, pixels, cause, remedy in (
         ("size", FRAMES[0, :9], "differ in size", "make them alike"),
@@ -59,7 +69,7 @@ def test_what_cannot_be_read_is_refused_in_one_line(film, tmp_path, refused):
     ):
         path = film / f"{name}.png"
         Image.fromarray(pixels).save(path)
-        refused(lambda: read_film(film), cause, remedy)
+        refused(lambda: [*read_film(film)], cause, remedy)
         path.unlink()
     (film / "broken.png").write_bytes(b"\x89PNG")
-    refused(lambda: read_film(film), "broken.png cannot be decoded", "as PNG")
+    refused(lambda: [*read_film(film)], "broken.png cannot be decoded", "as PNG")

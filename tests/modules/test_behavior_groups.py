@@ -135,10 +135,23 @@ def test_bad_inputs_are_rejected_and_change_nothing(phi):
             call(phi)
     with pytest.raises(ValueError, match="phi must"):
         groups.adapt(torch.zeros(2, 4))
+    with pytest.raises(ValueError, match=r"start must be finite numbers, got \[0.0, nan\]"):
+        groups.adapt(torch.zeros(4), torch.tensor([0.0, torch.nan]))
     assert len(groups.points) == 0
     for options in ({"smallest": 3}, {"smallest": 4.5}, {"evidence": 0}):
         with pytest.raises(ValueError, match="smallest must be"):
             BehaviorGroups(2, **options)
+
+
+def test_inputs_may_be_lists_and_arrays():
+    of_lists, of_tensors = BehaviorGroups(4), BehaviorGroups(4)
+    for phi in around(0, 25):
+        of_lists.adapt(phi.tolist(), [1.0, 2.0])
+        of_tensors.adapt(phi, torch.tensor([1.0, 2.0]))
+    found, expected = of_lists.state_dict(), of_tensors.state_dict()
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+    array = around(0, 3).numpy()
+    assert of_lists.lookup(array).group.equal(of_lists.lookup(torch.from_numpy(array)).group)
 
 
 def test_damaged_states_and_those_of_other_sizes_are_rejected_and_change_nothing():

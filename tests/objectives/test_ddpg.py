@@ -69,6 +69,14 @@ def test_targets_and_value_loss_by_hand(name, target_values, bounds):
     torch.testing.assert_close(result["td_error_max"], squares.max())
 
 
+def test_transitions_of_multi_step_are_refused():
+    """TorchRL's transform, whose targets would be wrong where an episode ends within n steps."""
+    batch = make_batch(4)
+    batch["nonterminal"] = torch.ones(4, 1, dtype=torch.bool)
+    with pytest.raises(ValueError, match=r"MultiStep leaves .* GroupReplay\(n_steps=...\)"):
+        make_loss("ddpg")(batch)
+
+
 def test_all_pairs_of_critics_take_turns():
     loss = make_loss("ensemble", pre_tanh_penalty=0.0)
     constant_critics(loss, (1.0, 10.0, 100.0), (0.1, 0.2, 0.3))

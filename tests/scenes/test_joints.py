@@ -42,7 +42,8 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("jointed")
     options = {"per_task": 6, "held_out_per_task": 2, "progress": False}
     dataset = record_demonstrations(folder / "demonstrations", scene=jointed(), **options)
-    weights, options = folder / "encoders.safetensors", {"scene": jointed(), "progress": False}
+    weights = folder / "encoders.safetensors"
+    options = {"tasks": TASKS, "scene": jointed(), "progress": False}
     parts = (dataset, None, weights, folder / "fit", TINY_ENCODERS)
     return dataset, *train_encoders(*parts, **options)
 

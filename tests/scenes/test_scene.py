@@ -207,6 +207,42 @@ def test_a_run_learns_on_another_robot_and_is_loaded_and_filmed(tmp_path, monkey
     assert {*read_table(tmp_path / "run" / "one_shot.csv")["task"]} == {*names}
 
 
+class Thrifty(Dot):
+    """A dot that draws into one array, and halves actions in place."""
+
+    def __init__(self):
+        super().__init__()
+        self.drawn = np.zeros((16, 24, 3), np.uint8)
+
+    def frame(self):
+        self.drawn[:] = super().frame()
+        return self.drawn
+
+    def step(self, action):
+        action *= 0.5
+        return super().step(2 * action)
+
+
+def thrifty(robot, task, seed):
+    act, action = demonstrate(robot, task, seed), np.zeros(1)
+
+    def again():
+        action[:] = act()
+        return action
+
+    return again
+
+
+def test_arrays_may_be_used_again(tmp_path):
+    """What a simulation or a demonstrator changes later is not what was recorded."""
+    options = {"per_task": np.int64(2), "held_out_per_task": 1, "progress": False}
+    plain = record_demonstrations(tmp_path / "plain", scene=scene(), **options)
+    robot = scene(Thrifty, demonstrator=thrifty)
+    found = record_demonstrations(tmp_path / "thrifty", scene=robot, **options)
+    for key, values in plain.items():
+        assert found[key].equal(values), key
+
+
 class Walker(Dot):
     """A dot that is slow, with a second action that does nothing, in square frames."""
 
@@ -243,7 +279,7 @@ def test_frames_actions_and_episodes_have_any_size(make, n_actions, n_steps, tmp
     monkeypatch.setitem(SCENES, "dot", walker)
     dataset = write_demonstrations(tmp_path / "own", shown, scene=walker, held_out_per_task=1)
     paths = tmp_path / "encoders.safetensors", tmp_path / "log"
-    options = {"scene": walker, "progress": False}
+    options = {"tasks": TASKS, "scene": walker, "progress": False}
     pretrained = train_encoders(dataset, None, *paths, TINY_ENCODERS, **options)
     config = run_config(algorithm={"max_steps": n_steps}, episodes=2)
     train(tmp_path / "run", pretrained, config)
