@@ -92,6 +92,10 @@ class NicoSimulation(Simulation):
         """Return joints (rad), grip and object positions (m), ``[16]``."""
         return self.environment.physics.privileged_state()
 
+    def joints(self) -> NDArray[Any]:
+        """Return the arm's three angles and the hand's mean curl (rad), ``[4]``."""
+        return self.environment.physics.joint_angles()
+
     def view(self) -> NDArray[np.uint8]:
         """Return NICO at the table, seen from the room, ``[280, 420, 3]``."""
         physics = self.environment.physics
@@ -126,8 +130,8 @@ class NicoSimulation(Simulation):
 class NicoEnv(SimulationEnv):
     """NICO at the table as a TorchRL environment; keys and behavior as of `SimulationEnv`.
 
-    ``"pixels"`` are ``[*B, 32, 64, 3]``, ``"state"`` is ``[*B, 16]``: joints (rad), grip and object
-    positions (m). Actions are ``[*B, 4]``. All simulations share one renderer. Episodes end on
+    ``"pixels"`` are ``[*B, 32, 64, 3]``, ``"joints"`` ``[*B, 4]`` (rad), ``"state"`` ``[*B, 16]``:
+    joints, grip and object positions (m). Actions are ``[*B, 4]``. All simulations share one renderer. Episodes end on
     success only: append ``StepCounter(50)`` for the paper's time limit.
 
     Args:
@@ -176,7 +180,8 @@ class NicoEnv(SimulationEnv):
             self._renderer.close()
 
 
-_FIRST_OBJECT = 7  # column of the state, after four joints (rad) and the grip point (m)
+_N_JOINTS = 4  # first columns of the state (rad)
+_FIRST_OBJECT = 7  # column of the state, after joints and the grip point (m)
 
 
 def _demonstrator(simulation: Simulation, task: str, seed: int) -> Callable[[], NDArray[Any]]:
@@ -228,6 +233,7 @@ NICO = Scene(
         },
         valid=_objects_on_table,
     ),
+    joints=StateColumns(center=STATE_CENTER[:_N_JOINTS], scale=STATE_SCALE[:_N_JOINTS]),
     weights={_PAPER: nico.PAPER_TASKS, _EIGHT: nico.ALL_TASKS},
     modules=_modules,
 )

@@ -10,14 +10,14 @@ from suites import nico
 from tests.helpers import contents
 
 TINY = {"per_task": 3, "held_out_per_task": 1, "progress": False}
-KEYS = {"pixels", "state", "action", "length", "task", "train", "seed"}
+KEYS = {"pixels", "state", "joints", "action", "length", "task", "train", "seed"}
 
 
 def test_recording_returns_what_loading_does(recorded):
     dataset = load_demonstrations(recorded)
 
     assert set(dataset.keys()) == KEYS
-    shapes = {"pixels": (51, 32, 64, 3), "state": (51, 16), "action": (50, 4)}
+    shapes = {"pixels": (51, 32, 64, 3), "state": (51, 16), "joints": (51, 4), "action": (50, 4)}
     for key in KEYS:
         assert dataset[key].shape == (9, *shapes.get(key, ()))
     assert dataset["pixels"].dtype == torch.uint8
@@ -26,6 +26,7 @@ def test_recording_returns_what_loading_does(recorded):
     assert dataset["train"].tolist() == [True, True, False] * 3
     assert dataset["seed"].tolist() == [0] * 9
     assert len(dataset["state"][:, 0].unique(dim=0)) == 9
+    assert dataset["joints"].equal(dataset["state"][..., :4])
     again = record_demonstrations(recorded, **TINY)  # complete: only opened
     for key in KEYS:
         torch.testing.assert_close(again[key], dataset[key], rtol=0, atol=0)
