@@ -154,7 +154,8 @@ class TrainedPolicy:
         """Condition the policy on a demonstration, complete or truncated.
 
         Args:
-            demonstration: Frames, uint8 ``[T, H, W, 3]``, T at least 1; NICO's are 32 x 64.
+            demonstration: Frames, uint8 ``[T, H, W, 3]``, T at least 1; NICO's are 32 x 64. Warns
+                if there are more than an episode of the scene has.
             task: Task label, for algorithms that need it; ignored by others.
             generator: Source of MAML's draws for adaptation; None: derived from the seed.
 
@@ -166,6 +167,13 @@ class TrainedPolicy:
                 missing; the policy is unchanged then.
         """
         frames = self._frames(demonstration, "a demonstration is uint8 [T, {}], T at least 1", 4)
+        scene = find_scene(self.config.scene)
+        if len(frames) > scene.max_steps + 1:
+            warnings.warn(
+                f"the demonstration has {len(frames)} frames, an episode of the scene at most "
+                f"{scene.max_steps + 1}: give as many frames a second as the scene has steps",
+                stacklevel=2,
+            )
         algorithm, index = self.algorithm, self._index
         if task is None and algorithm.needs_label:
             raise ValueError(
@@ -308,8 +316,15 @@ class TrainedPolicy:
             size, center, scale = self._joints.size, self._joints.center, self._joints.scale
             drawn = torch.randn(8, size, generator=noise) * torch.tensor(scale)
             inputs = [*zip(frames, drawn + torch.tensor(center), strict=True)]
+        exact = path.suffix == ".pt2"
+
+        def action(frame: Tensor, *joints: Tensor) -> Tensor:
+            # An exported program takes frames of floats, and acts wrongly; a bitwise operation
+            # refuses them. ONNX refuses them itself.
+            return self._action(frame.bitwise_and(255) if exact else frame, *joints)
+
         # Traced with the weights of today, which may decide what is computed at all.
-        traced = make_fx(lambda *seen: self._action(*seen))(*inputs[0])
+        traced = make_fx(action)(*inputs[0])
         program = torch.export.export(traced, inputs[0])
         scene = find_scene(self.config.scene)
         about = json.dumps({"scene": scene.identity, "rate": scene.rate, "tasks": [*self.tasks]})

@@ -265,7 +265,7 @@ def test_a_log_that_does_not_fit_is_refused(
 @pytest.mark.parametrize(
     ("changes", "cause"),
     [
-        ({"action": np.full((2, 4), np.nan)}, "has a action that is not finite"),
+        ({"action": np.full((2, 4), np.nan)}, "has numbers in action that are not finite"),
         ({"action": np.full((2, 4), 1.5)}, "an action of size 1.5"),
         ({"success": 1}, "has the success 1: give True or False"),
         ({"reward": 1.0}, "give 'pixels', 'action', 'success'"),

@@ -182,6 +182,17 @@ def test_an_exported_policy_acts_as_before_in_a_process_without_the_package(
     expected = [policy.act(frame) for frame in frames]
     np.testing.assert_allclose(np.load(tmp_path / "actions.npy"), expected, rtol=0, atol=1e-5)
     assert np.ptp(expected, axis=0).max() > 1e-4  # the frame matters
+    if kind == "pt2":  # ONNX refuses them by its types
+        act = torch.export.load(path).module()
+        with pytest.raises(RuntimeError, match="not implemented for 'Float'"):
+            act(torch.from_numpy(frames[0]) / 255)
+
+
+def test_a_demonstration_longer_than_an_episode_is_warned_of(load):
+    policy, film = load(), np.concatenate([DEMONSTRATIONS[1]] * 51)
+    with pytest.warns(UserWarning, match=f"has {len(film)} frames, an episode .* at most 51"):
+        policy.condition(film)
+    policy.condition(film[:51])
 
 
 def test_onnx_without_the_extra_is_refused_in_one_line(load, tmp_path, monkeypatch):

@@ -67,7 +67,7 @@ def success_section(setting: Setting) -> list[Section]:
     )
     tests = [f"{name} {value}" for name, value in conditions.items() if value is not None]
     notes = (
-        f"Tasks: {tasks}. {first.last:,} episodes, "
+        f"Tasks: {tasks}. {first.config['episodes']:,} episodes, "
         + ", ".join([f"tests every {first.eval_every}", *tests])
         + ".",
         "The seed is the unit: its score is the mean over tasks of the success in tests over the "

@@ -380,6 +380,8 @@ def _check_episodes(
     keys: set[str] | None = None
     lengths = []
     for name in episodes:
+        if isinstance(episodes[name], Mapping):
+            raise ValueError(f"{name!r} has one mapping: give a list of episodes, a mapping each")
         for number in range(len(episodes[name])):
             episode = episodes[name][number]
             try:
@@ -422,7 +424,7 @@ def check_episode(scene: Scene, episode: Mapping[str, Any]) -> int:
                 f"{length} frames"
             )
         if not np.isfinite(values).all():
-            raise ValueError(f"has a {key} that is not finite: mend it, or leave the episode out")
+            raise ValueError(f"has numbers in {key} that are not finite: leave the episode out")
     largest = np.abs(np.asarray(episode.get("action", 0), np.float32)).max()
     if largest > 1:
         raise ValueError(f"has an action of size {largest:.4g}: scale actions to [-1, 1]")

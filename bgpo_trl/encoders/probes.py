@@ -34,6 +34,8 @@ from bgpo_trl.objectives.supervised import sequence_reconstruction_loss
 from bgpo_trl.scenes import StateColumns
 
 _GOOD_RECONSTRUCTION, _GOOD_NEAREST, _GOOD_INVERSE = 0.5, 0.9, 0.5
+_ALIKE = 0.5  # correlation of actions from which a comparison means something
+_COMPARED = 256  # frames whose colors are compared
 
 
 def probe(
@@ -146,7 +148,7 @@ def complaints(result: Mapping[str, float]) -> list[str]:
         lines.append(
             f"{nearest:.0%} of the held-out demonstrations are nearest to one of their own task, "
             f"{chance:.0%} by chance: groups of behaviors will mix tasks; show objects larger, "
-            "train longer (vae.steps, lae.steps), or record more demonstrations"
+            "train longer (vae.steps, lae.steps), or record more demonstrations, or play"
         )
     if result.get("inverse_r2", 1.0) < _GOOD_INVERSE:
         lines.append(
@@ -154,6 +156,65 @@ def complaints(result: Mapping[str, float]) -> list[str]:
             "play, train longer (inverse.steps), or use recorded actions (bank_actions)"
         )
     return [line.replace("%", " %") for line in lines]
+
+
+@torch.no_grad()
+def mismatches(
+    representation: Representation, dataset: TensorDictBase, latent: Tensor
+) -> list[str]:
+    """Return in what demonstrations seem unlike those that encoders were trained on, a line each.
+
+    Recorded actions are compared with inferred ones, also with those of the step before and after,
+    and frames with the same frames whose red and blue are exchanged.
+
+    Args:
+        representation: The trained encoders.
+        dataset: Reads ``pixels``, ``length`` and, if it is there, ``action``.
+        latent: Latents of its frames ``[N, T, F]``.
+    """
+    lines, network, length = [], representation.frame_network, dataset["length"]
+    inverse, recorded = representation.inverse, dataset.get("action", None)
+    if inverse is not None and recorded is not None:
+        lines += _compare_actions(recorded, inverse(latent, length), length)
+    if isinstance(network, VAE):
+        frames = valid_frames(dataset)[:: max(1, int(length.sum()) // _COMPARED)]
+        given, exchanged = (
+            (some / 255 - network.decode(network.encode(some)[0])).square().mean()
+            for some in (frames, frames.flip(-1))
+        )
+        if exchanged < given:
+            lines.append(
+                "frames fit the encoders better with red and blue exchanged: give them red first "
+                "(OpenCV's are blue first, frame[..., ::-1] turns them)"
+            )
+    return lines
+
+
+def _compare_actions(recorded: Tensor, inferred: Tensor, length: Tensor) -> list[str]:
+    """Return in what recorded actions ``[N, T - 1, A]`` differ from inferred ones."""
+
+    def correlation(one: Tensor, other: Tensor) -> float:
+        return float((one * other).sum() / (one.norm() * other.norm()).clamp_min(1e-9))
+
+    moves = valid_steps(length - 1, recorded.shape[1])
+    later = moves[:, 1:]
+    now = correlation(recorded[moves], inferred[moves])
+    late = correlation(recorded[:, 1:][later], inferred[:, :-1][later])
+    early = correlation(recorded[:, :-1][later], inferred[:, 1:][later])
+    if max(late, early) > max(now, _ALIKE):
+        when = "late" if late > early else "early"
+        return [
+            f"recorded actions seem to be a step too {when} (correlation with what frames show: "
+            f"{now:.2f}, shifted {max(late, early):.2f}): action t leads from frame t to t + 1"
+        ]
+    own = inferred[moves]
+    scale = float((recorded[moves] * own).sum() / own.square().sum().clamp_min(1e-9))
+    if now > _ALIKE and not 0.5 < scale < 2:
+        return [
+            f"recorded actions are {scale:.2f} times as large as frames suggest: scale them as "
+            "those of the encoders' demonstrations"
+        ]
+    return []
 
 
 def ridge_predict(x: Tensor, y: Tensor, x_new: Tensor, penalty: float = 1e-4) -> Tensor:

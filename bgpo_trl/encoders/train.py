@@ -17,7 +17,7 @@ from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.fitting import Log, retrain_inverse, train_representation
 from bgpo_trl.encoders.pretrained import bank_path
-from bgpo_trl.encoders.probes import complaints, probe
+from bgpo_trl.encoders.probes import complaints, mismatches, probe
 from bgpo_trl.encoders.representation import (
     Representation,
     encode_frames,
@@ -114,6 +114,8 @@ def make_bank(
 ) -> DemonstrationBank:
     """Embed demonstrations; keep latents, actions and joints of the training ones.
 
+    Warns of what `mismatches` finds.
+
     Args:
         representation: The trained encoders.
         dataset: Reads ``pixels`` ``[N, T, H, W, 3]``, ``length``, ``task`` and ``train`` ``[N]``,
@@ -127,6 +129,8 @@ def make_bank(
     """
     length = dataset["length"]
     latent = encode_frames(representation.frame_network, dataset)
+    for mismatch in mismatches(representation, dataset, latent):
+        warnings.warn(mismatch, stacklevel=2)
     action = dataset.get("action", None)
     if actions == "inferred" or action is None:
         inverse = representation.inverse

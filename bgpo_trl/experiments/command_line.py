@@ -11,6 +11,7 @@ import sys
 import sysconfig
 import threading
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -49,7 +50,7 @@ def command_line(
     asked: type = get_type_hints(command)["arguments"] if kind is None else kind
     resumable = hasattr(asked, "resume")
     try:
-        with _terminable() if resumable else contextlib.nullcontext():
+        with _terminable() if resumable else contextlib.nullcontext(), _plain_warnings():
             arguments = _parse(asked, options, program, line)
             import_plugin(getattr(arguments, "module", None))
             text = command(arguments)
@@ -113,6 +114,23 @@ def _terminable() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+@contextlib.contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Write this package's warnings as one line each, without the line of code."""
+    usual, package = warnings.formatwarning, Path(__file__).parents[1]
+
+    def format_one(message: Any, category: Any, filename: str, *place: Any, **line: Any) -> str:
+        if Path(filename).is_relative_to(package):
+            return f"warning: {message}\n"
+        return usual(message, category, filename, *place, **line)
+
+    warnings.formatwarning = format_one
+    try:
+        yield
+    finally:
+        warnings.formatwarning = usual
 
 
 def _parse(kind: type, options: Sequence[str] | None, program: str | None, line: str) -> Any:

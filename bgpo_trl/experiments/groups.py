@@ -126,7 +126,8 @@ def groups(arguments: GroupsArguments) -> str:
         table.append([order, *(" ".join(column) for column in zip(*columns, strict=True))])
     n_networks = len(schedules) * len(arguments.seeds)
     lines = [
-        f"{bank.tasks[one]} and {bank.tasks[other]} share a group in {count} of {n_networks}."
+        f"{bank.tasks[one]} and {bank.tasks[other]} share a group in {count} of {n_networks}: show "
+        "more demonstrations, or better encoders (`bgpo probes` says what they lack)."
         for (one, other), count in shared.most_common()
     ]
     return "\n".join([markdown(table), "", *lines]).rstrip()

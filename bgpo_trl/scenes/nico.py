@@ -131,8 +131,8 @@ class NicoEnv(SimulationEnv):
     """NICO at the table as a TorchRL environment; keys and behavior as of `SimulationEnv`.
 
     ``"pixels"`` are ``[*B, 32, 64, 3]``, ``"joints"`` ``[*B, 4]`` (rad), ``"state"`` ``[*B, 16]``:
-    joints, grip and object positions (m). Actions are ``[*B, 4]``. All simulations share one renderer. Episodes end on
-    success only: append ``StepCounter(50)`` for the paper's time limit.
+    joints, grip and object positions (m). Actions are ``[*B, 4]``. All simulations share one
+    renderer. Episodes end on success only: append ``StepCounter(50)`` for the paper's time limit.
 
     Args:
         tasks: Names of the tasks, in the order of their presentation.

@@ -237,7 +237,8 @@ class SimulationEnv(EnvBase):
                 self._current["executed_action"][row] = outcome.executed
             elif outcome.executed is not asked[row]:
                 raise ValueError(
-                    "only a RobotEnv takes the executed action: make the environment one"
+                    "a simulation executes what it is asked: leave Outcome.executed out, or, for a "
+                    "real robot, make the environment a RobotEnv"
                 )
 
         self._threads.each(asked, step, record)

@@ -134,7 +134,11 @@ MISSING = {**episodes_of(), TASKS[1]: [episode_of(2), episode_of(7), None, episo
         (changed(action=np.zeros((6, 4))), "has the action float64 [6, 4]", "[5, 4]"),
         (changed(action=[["left"] * 4] * 5), "has the action", "give [5, 4] numbers"),
         (changed(action=np.full((5, 4), -1.5)), "an action of size 1.5", "scale actions"),
-        (changed(action=np.full((5, 4), np.nan)), "not finite", "mend it"),
+        (
+            changed(action=np.full((5, 4), np.nan)),
+            "action that are not finite",
+            "leave the episode out",
+        ),
         (changed(state=np.zeros((6, 15))), "has the state", "give [6, 16] numbers"),
         ({}, "there are no episodes", "give some"),
         ({**episodes_of(), "push_green_to_glass": []}, "no episode of", "leave the task out"),

@@ -1,15 +1,21 @@
 """Probes against known maps, and which frames they read."""
 
+from pathlib import Path
+
 import pytest
 import torch
 from tensordict import TensorDict
 
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.probes import (
+    mismatches,
     probe,
     reconstruction_picture,
     ridge_predict,
 )
-from bgpo_trl.encoders.representation import Representation
+from bgpo_trl.encoders.representation import Representation, encode_frames
+from bgpo_trl.encoders.train import make_bank
 from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
@@ -47,6 +53,26 @@ def test_ridge_regression_finds_a_linear_map_at_any_scale() -> None:
 
     predicted = ridge_predict(x * scale, truth(x), x_new * scale, penalty=1e-8)
     torch.testing.assert_close(predicted, truth(x_new), rtol=1e-3, atol=1e-3)
+
+
+def test_demonstrations_unlike_those_of_the_encoders_are_told(tmp_path: Path) -> None:
+    recording = {"per_task": 2, "held_out_per_task": 1, "seed": 9, "progress": False}
+    dataset = record_demonstrations(tmp_path / "shown", **recording)
+    encoders = load_pretrained()[0]
+    latent, action = encode_frames(encoders.frame_network, dataset), dataset["action"]
+    none = torch.zeros_like(action[:, :1])
+    for changed, said in (
+        (action, None),
+        (torch.cat([none, action[:, :-1]], 1), "a step too late"),
+        (torch.cat([action[:, 1:], none], 1), "a step too early"),
+        (0.2 * action, "0.20 times as large as frames suggest"),
+        (torch.rand_like(action), None),  # which nothing can be told of
+    ):
+        found = mismatches(encoders, dataset.clone().update({"action": changed}), latent)
+        assert [said in line for line in found] == ([] if said is None else [True])
+    blue = dataset.clone().update({"pixels": dataset["pixels"].flip(-1)}).exclude("action")
+    with pytest.warns(UserWarning, match="better with red and blue exchanged"):
+        make_bank(encoders, blue, tasks=NICO.default_tasks)
 
 
 def test_picture_shows_frames_over_reconstructions(untrained: Representation) -> None:
