@@ -1,14 +1,15 @@
-"""Time of an action: of a trained policy, and of the program that it exports.
+"""Time of an action: of a trained policy, and of the programs that it exports.
 
     python benchmarks/speed/exported.py RUN
 
-Both map a frame to an action, arrays of NumPy, on one thread of the CPU, and take turns. Times are
-CPU times, which other work on the machine lengthens less. The policy is conditioned on noise, and
-sees noise: what it computes is the same for all frames.
+That of ONNX needs the extra ``onnx``. All map a frame to an action, arrays of NumPy, on one thread
+of the CPU, and take turns. Times are CPU times, which other work on the machine lengthens less. The
+policy is conditioned on noise, and sees noise: what it computes is the same for all frames.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -31,7 +32,7 @@ Act = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Arguments(ImportArguments):
-    """Time the actions of a trained policy and of the program that it exports."""
+    """Time the actions of a trained policy and of the programs that it exports."""
 
     run: tyro.conf.Positional[Path]
     """Run directory."""
@@ -42,11 +43,11 @@ class Arguments(ImportArguments):
 
 
 def contenders(policy: TrainedPolicy, folder: Path) -> dict[str, Act]:
-    """Return both ways to an action, by name.
+    """Return the ways to an action, by name.
 
     Args:
         policy: The policy, which has seen a demonstration.
-        folder: Folder for the exported program.
+        folder: Folder for the exported programs.
     """
     policy.export(folder / "policy.pt2")
     program = torch.export.load(folder / "policy.pt2").module()
@@ -54,7 +55,15 @@ def contenders(policy: TrainedPolicy, folder: Path) -> dict[str, Act]:
     def exported(frame: np.ndarray) -> np.ndarray:
         return program(torch.from_numpy(frame)).numpy()
 
-    return {"TrainedPolicy.act": policy.act, "exported program": exported}
+    found: dict[str, Act] = {"TrainedPolicy.act": policy.act, "exported program": exported}
+    if importlib.util.find_spec("onnxruntime"):
+        policy.export(folder / "policy.onnx")
+        runtime = importlib.import_module("onnxruntime")
+        options = runtime.SessionOptions()
+        options.intra_op_num_threads = 1
+        session = runtime.InferenceSession(folder / "policy.onnx", options)
+        found["ONNX model"] = lambda frame: session.run(None, {"frame": frame})[0]
+    return found
 
 
 def measure(

@@ -1,5 +1,6 @@
-"""A policy and its exported program take turns at the same frames."""
+"""A policy and its exported programs take turns at the same frames."""
 
+import importlib.util
 import re
 
 import numpy as np
@@ -24,9 +25,10 @@ def test_contenders_act_alike_and_on_every_frame(run, tmp_path):
     frames = np.random.default_rng(1).integers(0, 256, (3, 32, 64, 3), np.uint8)
     policy.condition(frames)
     acts, seen = exported.contenders(policy, tmp_path), {}
-    ours, theirs = (np.stack([act(frame) for frame in frames]) for act in acts.values())
+    ours, *others = (np.stack([act(frame) for frame in frames]) for act in acts.values())
     assert ours.shape == (3, 4) and not np.allclose(ours[0], ours[1], atol=1e-4)
-    np.testing.assert_allclose(theirs, ours, atol=1e-5)
+    for theirs in others:
+        np.testing.assert_allclose(theirs, ours, atol=1e-5)
 
     def counted(name):
         return lambda frame: seen.setdefault(name, []).append(frame) or acts[name](frame)
@@ -37,10 +39,14 @@ def test_contenders_act_alike_and_on_every_frame(run, tmp_path):
     assert all(found[4] is not found[3] and found[4] is found[1] for found in seen.values())
 
 
-def test_the_table_has_both(run, capsys, monkeypatch):
+def test_the_table_has_all(run, capsys, monkeypatch):
     monkeypatch.setattr(exported, "set_threads", lambda n: None)
     exported.main(exported.Arguments(run, frames=2, rounds=3))
-    *_, ours, theirs = capsys.readouterr().out.splitlines()
+    _, _, ours, *others = capsys.readouterr().out.splitlines()
     number = r"[\d.]+ \([\d.]+-[\d.]+\)"
     assert re.fullmatch(rf"\| TrainedPolicy.act \| {number} \| 1.00 \(1.00-1.00\) \|", ours)
-    assert re.fullmatch(rf"\| exported program \| {number} \| {number} \|", theirs)
+    names = [line.split(" | ")[0].strip("| ") for line in others]
+    onnx = ["ONNX model"] if importlib.util.find_spec("onnxruntime") else []
+    assert names == ["exported program", *onnx]
+    for name, theirs in zip(names, others, strict=True):
+        assert re.fullmatch(rf"\| {name} \| {number} \| {number} \|", theirs)
