@@ -52,11 +52,20 @@ def open_complete(path: Path, *, verify: bool = True) -> tuple[TensorDict, dict[
     """
     meta = read_meta(path)
     # The scene of demonstrations from elsewhere need not be known here.
-    version = find_scene(meta["scene"]).full_version if meta["scene"] in SCENES else None
-    if version not in (None, meta["scene_version"]):
+    scene = find_scene(meta["scene"]) if meta["scene"] in SCENES else None
+    if scene is not None and scene.full_version != meta["scene_version"]:
         raise ValueError(
-            f"{path} was recorded in scene {meta['scene_version']!r}, this is {version}; {_REMEDY}"
+            f"{path} was recorded in scene {meta['scene_version']!r}, this is "
+            f"{scene.full_version}; {_REMEDY}"
         )
+    if scene is not None:
+        found, known = meta["frame_shape"], [*scene.frame_shape]
+        n_actions = meta["action_size"] or scene.action_size
+        if (found, n_actions) != (known, scene.action_size):
+            raise ValueError(
+                f"{path} has frames of {found} and actions of {n_actions} numbers, the scene "
+                f"{scene.name!r} of {known} and {scene.action_size}; {_REMEDY}"
+            )
     if not meta.get("checksum"):
         raise ValueError(
             f"the recording at {path} is not complete; resume it with the same command"

@@ -35,6 +35,14 @@ def truncate(path: Path) -> None:
         (lambda p: (p / "dataset.json").unlink(), "not a dataset of demonstrations"),
         (lambda p: edit(p / "dataset.json", checksum=None), "not complete; resume it"),
         (lambda p: edit(p / "dataset.json", scene_version="old"), "recorded in scene 'old'"),
+        (
+            lambda p: edit(p / "dataset.json", action_size=3),
+            "and actions of 3 numbers",
+        ),
+        (
+            lambda p: edit(p / "dataset.json", frame_shape=[8, 8]),
+            r"frames of \[8, 8\] and actions",
+        ),
     ],
 )
 def test_what_is_not_whole_is_refused_in_one_line(copy, damage, message):
