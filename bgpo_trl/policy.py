@@ -172,7 +172,7 @@ class TrainedPolicy:
             warnings.warn(
                 f"the demonstration has {len(frames)} frames, an episode of the scene at most "
                 f"{scene.max_steps + 1}: give as many frames a second as the scene has steps",
-                stacklevel=2,
+                stacklevel=3,  # of the call before no_grad's
             )
         algorithm, index = self.algorithm, self._index
         if task is None and algorithm.needs_label:

@@ -182,7 +182,7 @@ def mismatches(
             (some / 255 - network.decode(network.encode(some)[0])).square().mean()
             for some in (frames, frames.flip(-1))
         )
-        if exchanged < given:
+        if exchanged < 0.9 * given:
             lines.append(
                 "frames fit the encoders better with red and blue exchanged: give them red first "
                 "(OpenCV's are blue first, frame[..., ::-1] turns them)"

@@ -130,7 +130,7 @@ def make_bank(
     length = dataset["length"]
     latent = encode_frames(representation.frame_network, dataset)
     for mismatch in mismatches(representation, dataset, latent):
-        warnings.warn(mismatch, stacklevel=2)
+        warnings.warn(mismatch, stacklevel=3)  # of the call before no_grad's
     action = dataset.get("action", None)
     if actions == "inferred" or action is None:
         inverse = representation.inverse
