@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+import warnings
 from collections.abc import Mapping, Sequence
 from operator import index
 from pathlib import Path
@@ -244,7 +245,8 @@ def write_demonstrations(
     banks no steps: demonstrations then tell the task, but are no experience. Without joints, they
     are none for policies that read joints. The ground truth serves probes alone.
 
-    All episodes are checked before anything is written. Each is indexed twice, so a sequence may
+    All episodes are checked before anything is written; a warning names episodes without movement,
+    and such as are given twice. Each is indexed twice, so a sequence may
     load its episodes from files on demand.
 
     Args:
@@ -385,9 +387,10 @@ def _check_counts(episodes: Episodes, tasks: Sequence[str], held_out_per_task: i
 def _check_episodes(
     scene: Scene, episodes: Episodes, *, logged: bool
 ) -> tuple[set[str], list[int]]:
-    """Return the keys of all episodes and the number of frames of each."""
+    """Return the keys of all episodes and the number of frames of each; warn of doubtful ones."""
     keys: set[str] | None = None
-    lengths = []
+    lengths, still, again = [], list[str](), list[str]()
+    known = set[bytes]()
     for name in episodes:
         if isinstance(episodes[name], Mapping):
             raise ValueError(f"{name!r} has one mapping: give a list of episodes, a mapping each")
@@ -398,7 +401,19 @@ def _check_episodes(
                 lengths.append(check_episode(scene, episode))
             except ValueError as error:
                 raise ValueError(f"episode {number} of {name!r} {error}") from None
-            keys = set(episode)
+            keys, pixels = set(episode), np.ascontiguousarray(episode["pixels"])
+            if (pixels == pixels[0]).all():
+                still.append(f"{number} of {name!r}")
+            content = hashlib.sha256(pixels.data).digest()
+            if content in known:
+                again.append(f"{number} of {name!r}")
+            known.add(content)
+    for which, what in (
+        (still, "show one frame throughout: did the camera stand still?"),
+        (again, "have the frames of an earlier one: give each once"),
+    ):
+        if which:
+            warnings.warn(f"{len(which)} episodes, such as {which[0]}, {what}", stacklevel=4)
     return keys or set(), lengths
 
 

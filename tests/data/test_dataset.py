@@ -117,6 +117,18 @@ def test_episodes_may_be_tensors_that_are_loaded_on_demand(tmp_path):
     assert (lazy == eager).all()
 
 
+def test_episodes_without_movement_and_such_as_are_given_twice_are_named(tmp_path):
+    moving = episode_of(4, keys=("pixels",))
+    still = {"pixels": moving["pixels"][:1].repeat(3, 0)}
+    with pytest.warns(UserWarning) as caught:
+        write(tmp_path / "own", {TASKS[0]: [moving, still, moving], TASKS[1]: [still, moving]})
+    assert [str(one.message) for one in caught] == [
+        f"2 episodes, such as 1 of '{TASKS[0]}', show one frame throughout: did the camera stand "
+        "still?",
+        f"3 episodes, such as 2 of '{TASKS[0]}', have the frames of an earlier one: give each once",
+    ]
+
+
 def changed(**entries):
     """Episodes of which the third of the second task is changed; None removes an entry."""
     episodes = episodes_of()
