@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from one_shot import OneShotArguments, one_shot
+from PIL import Image
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
@@ -180,6 +181,7 @@ def test_a_run_learns_on_another_robot_and_is_loaded_and_filmed(tmp_path, monkey
         demonstrator=lambda robot, task, seed: demonstrate(robot, short[task], seed),
         tasks=names,
         default_tasks=names,
+        rate=12.5,
     )
     monkeypatch.setitem(SCENES, "dot", told)
     encoders, bank = pretrain(told, tmp_path, per_task=4)
@@ -191,6 +193,7 @@ def test_a_run_learns_on_another_robot_and_is_loaded_and_filmed(tmp_path, monkey
     assert (len(table), {*table["task"]}) == (8, {*names})
     films = [*(tmp_path / "run" / "figures").glob("move*.gif")]
     assert len(films) == 2
+    assert Image.open(films[0]).info["duration"] == 80  # ms a frame, as fast as the robot
 
     # The encoders do not come with the scene: the run keeps them.
     policy = load_run(tmp_path / "run")
