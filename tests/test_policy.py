@@ -195,6 +195,16 @@ def test_a_demonstration_longer_than_an_episode_is_warned_of(load):
     policy.condition(film[:51])
 
 
+def test_a_demonstration_that_seems_blue_first_is_warned_of(load, monkeypatch):
+    policy = load()
+    monkeypatch.setattr(
+        "bgpo_trl.policy.doubt_colors", lambda network, frames: "give them red first"
+    )
+    with pytest.warns(UserWarning, match="give them red first") as caught:
+        policy.condition(DEMONSTRATIONS[1])
+    assert caught[0].filename == __file__
+
+
 def test_onnx_without_the_extra_is_refused_in_one_line(load, tmp_path, monkeypatch):
     policy = load("bgpo")
     policy.condition(DEMONSTRATIONS[1])

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from bgpo_trl.encoders.representation import (
     Representation,
+    doubt_colors,
     encode_frames,
     mean_frame,
     split,
@@ -176,18 +177,8 @@ def mismatches(
     inverse, recorded = representation.inverse, dataset.get("action", None)
     if inverse is not None and recorded is not None:
         lines += _compare_actions(recorded, inverse(latent, length), length)
-    if isinstance(network, VAE):
-        frames = valid_frames(dataset)[:: max(1, int(length.sum()) // _COMPARED)]
-        given, exchanged = (
-            (some / 255 - network.decode(network.encode(some)[0])).square().mean()
-            for some in (frames, frames.flip(-1))
-        )
-        if exchanged < 0.9 * given:
-            lines.append(
-                "frames fit the encoders better with red and blue exchanged: give them red first "
-                "(OpenCV's are blue first, frame[..., ::-1] turns them)"
-            )
-    return lines
+    doubt = doubt_colors(network, valid_frames(dataset)[:: max(1, int(length.sum()) // _COMPARED)])
+    return [*lines, doubt] if doubt else lines
 
 
 def _compare_actions(recorded: Tensor, inferred: Tensor, length: Tensor) -> list[str]:

@@ -106,6 +106,26 @@ def encode_frames(network: FrameNetwork, dataset: TensorDictBase) -> Tensor:
 
 
 @torch.no_grad()
+def doubt_colors(network: FrameNetwork, frames: Tensor) -> str:
+    """Return what to do if frames uint8 ``[N, H, W, 3]`` seem to have blue first, else "".
+
+    A VAE then reconstructs them better with red and blue exchanged; other networks cannot tell.
+    """
+    if not isinstance(network, VAE):
+        return ""
+    given, exchanged = (
+        (some / 255 - network.decode(network.encode(some)[0])).square().mean()
+        for some in (frames, frames.flip(-1))
+    )
+    if exchanged >= 0.9 * given:  # in doubt, as it is
+        return ""
+    return (
+        "frames fit the encoders better with red and blue exchanged: give them red first "
+        "(OpenCV's are blue first, frame[..., ::-1] turns them)"
+    )
+
+
+@torch.no_grad()
 def embed_demonstrations(representation: Representation, dataset: TensorDictBase) -> Tensor:
     """Embed whole demonstrations as phi, float32 ``[N, embedding_size]`` (Alg. 1).
 

@@ -14,7 +14,7 @@ from bgpo_trl.encoders.probes import (
     reconstruction_picture,
     ridge_predict,
 )
-from bgpo_trl.encoders.representation import Representation, encode_frames
+from bgpo_trl.encoders.representation import Representation, doubt_colors, encode_frames
 from bgpo_trl.encoders.train import make_bank
 from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
@@ -70,6 +70,9 @@ def test_demonstrations_unlike_those_of_the_encoders_are_told(tmp_path: Path) ->
     ):
         found = mismatches(encoders, dataset.clone().update({"action": changed}), latent)
         assert [said in line for line in found] == ([] if said is None else [True])
+    shown = dataset["pixels"][0, : dataset["length"][0]]
+    assert not doubt_colors(encoders.frame_network, shown)
+    assert "red and blue exchanged" in doubt_colors(encoders.frame_network, shown.flip(-1))
     blue = dataset.clone().update({"pixels": dataset["pixels"].flip(-1)}).exclude("action")
     with pytest.warns(UserWarning, match="better with red and blue exchanged"):
         make_bank(encoders, blue, tasks=NICO.default_tasks)
