@@ -224,6 +224,7 @@ def _empty(meta: Mapping[str, Any]) -> TensorDict:
 Episodes = Mapping[str, Sequence[Mapping[str, Any]]]
 """Episodes by the name of their task; for an episode's entries, see `write_demonstrations`."""
 _KEYS = ("pixels", "action", "state", "joints")
+_FAR = 20  # scales, by which degrees for radians are found
 
 
 def write_demonstrations(
@@ -246,8 +247,8 @@ def write_demonstrations(
     are none for policies that read joints. The ground truth serves probes alone.
 
     All episodes are checked before anything is written; a warning names episodes without movement,
-    and such as are given twice. Each is indexed twice, so a sequence may
-    load its episodes from files on demand.
+    such as are given twice, and joints far from the scene's center. Each is indexed twice, so a
+    sequence may load its episodes from files on demand.
 
     Args:
         path: Folder of the dataset, which must not exist.
@@ -389,7 +390,7 @@ def _check_episodes(
 ) -> tuple[set[str], list[int]]:
     """Return the keys of all episodes and the number of frames of each; warn of doubtful ones."""
     keys: set[str] | None = None
-    lengths, still, again = [], list[str](), list[str]()
+    lengths, still, again, far = [], list[str](), list[str](), list[str]()
     known = set[bytes]()
     for name in episodes:
         if isinstance(episodes[name], Mapping):
@@ -404,6 +405,10 @@ def _check_episodes(
             keys, pixels = set(episode), np.ascontiguousarray(episode["pixels"])
             if (pixels == pixels[0]).all():
                 still.append(f"{number} of {name!r}")
+            if scene.joints is not None and "joints" in episode:
+                apart = np.asarray(episode["joints"]) - scene.joints.center
+                if (np.abs(apart) > _FAR * np.asarray(scene.joints.scale)).any():
+                    far.append(f"{number} of {name!r}")
             content = hashlib.sha256(pixels.data).digest()
             if content in known:
                 again.append(f"{number} of {name!r}")
@@ -411,9 +416,11 @@ def _check_episodes(
     for which, what in (
         (still, "show one frame throughout: did the camera stand still?"),
         (again, "have the frames of an earlier one: give each once"),
+        (far, f"have joints farther than {_FAR} scales from their center: is their unit another?"),
     ):
         if which:
-            warnings.warn(f"{len(which)} episodes, such as {which[0]}, {what}", stacklevel=4)
+            share = f"{len(which)} of {len(lengths)} episodes"
+            warnings.warn(f"{share}, such as {which[0]}, {what}", stacklevel=4)
     return keys or set(), lengths
 
 

@@ -106,6 +106,13 @@ def test_joints_of_others_come_by_arrays_and_lerobot(made, tmp_path):
     n_steps = written["joints"].shape[1]
     assert written["joints"].equal(dataset["joints"][:, :n_steps])
     assert load_demonstrations(tmp_path / "own")["joints"].equal(written["joints"])
+    for some in episodes.values():
+        for episode in some:
+            episode["joints"] = np.degrees(episode["joints"])
+    with pytest.warns(
+        UserWarning, match="12 of 12 episodes, such as 0 of 'left', have joints farther"
+    ):
+        write_demonstrations(tmp_path / "degrees", episodes, **options)
 
 
 def test_replays_hold_joints_as_policies_read_them(made, dot, tmp_path):
