@@ -123,8 +123,8 @@ def test_episodes_without_movement_and_such_as_are_given_twice_are_named(tmp_pat
     with pytest.warns(UserWarning) as caught:
         write(tmp_path / "own", {TASKS[0]: [moving, still, moving], TASKS[1]: [still, moving]})
     assert [str(one.message) for one in caught] == [
-        f"2 of 5 episodes, such as 1 of '{TASKS[0]}', show one frame throughout: did the camera stand "
-        "still?",
+        f"2 of 5 episodes, such as 1 of '{TASKS[0]}', show one frame throughout: did the camera "
+        "stand still?",
         f"3 of 5 episodes, such as 2 of '{TASKS[0]}', have the frames of an earlier one: give "
         "each once",
     ]
