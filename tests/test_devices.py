@@ -5,6 +5,7 @@ GPU; a GPU is tested too if there is one.
 """
 
 from contextlib import nullcontext
+from copy import deepcopy
 from dataclasses import replace
 
 import pytest
@@ -12,7 +13,11 @@ import torch
 from tensordict import TensorDict
 
 from bgpo_trl.encoders.fitting import train_representation
-from bgpo_trl.encoders.representation import load_representation, save_representation
+from bgpo_trl.encoders.representation import (
+    doubt_colors,
+    load_representation,
+    save_representation,
+)
 from bgpo_trl.modules.frame_network import FRAME_NETWORKS, FrameNetwork
 from bgpo_trl.training import Trainer
 from tests.helpers import TINY_ENCODERS, rows
@@ -47,6 +52,12 @@ def test_tensors_of_two_devices_do_not_mix():
         assert weight.grad.cpu().equal(torch.full((3,), 2.0))
         there[0] += 1.0
         assert (there.cpu() + torch.tensor(1.0)).tolist() == [[3.0] * 3, [2.0] * 3]
+
+
+def test_colors_are_doubted_wherever_the_network_is(device, encoders):
+    frames = torch.randint(256, (3, 32, 64, 3), generator=torch.Generator().manual_seed(0))
+    network, frames = deepcopy(encoders.frame_network), frames.to(torch.uint8)
+    assert doubt_colors(network.to(device), frames) == doubt_colors(encoders.frame_network, frames)
 
 
 @pytest.mark.usefixtures("easy_world")

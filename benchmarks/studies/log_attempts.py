@@ -5,6 +5,7 @@ python benchmarks/studies/log_attempts.py data/log --noise 0.3
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,6 +14,7 @@ import numpy as np
 import tyro
 
 from bgpo_trl.data.dataset import write_logged_episodes
+from bgpo_trl.data.recording import perform
 from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.scenes import Scene, Simulation, find_scene
 
@@ -39,19 +41,17 @@ def attempt(
     simulation: Simulation, scene: Scene, task: str, noise: float, seed: int
 ) -> dict[str, Any]:
     """Return one episode."""
-    assert scene.demonstrator is not None
-    simulation.seed(seed)
-    simulation.reset(task)
-    act, random = scene.demonstrator(simulation, task, seed), np.random.default_rng(seed)
-    frames, actions, success = [simulation.frame()], [], False
-    while not success and len(actions) < scene.max_steps:
-        asked = act() + noise * random.standard_normal(scene.action_size)
-        actions.append(asked.clip(-1, 1).astype(np.float32))
-        success, failure, _ = simulation.step(actions[-1].astype(np.float64))
-        frames.append(simulation.frame())
-        if failure:
-            break
-    return {"pixels": np.stack(frames), "action": np.stack(actions), "success": bool(success)}
+    random = np.random.default_rng(seed)
+
+    def with_noise(demonstrator: Callable[[], np.ndarray]) -> Callable[[], np.ndarray]:
+        def act() -> np.ndarray:
+            asked = demonstrator() + noise * random.standard_normal(scene.action_size)
+            return asked.clip(-1, 1).astype(np.float32).astype(np.float64)  # exact in the log
+
+        return act
+
+    episode, success = perform(scene, simulation, task, seed, seed, with_noise)
+    return {**episode, "success": success}
 
 
 def log_attempts(arguments: LogArguments) -> str:

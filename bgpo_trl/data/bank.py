@@ -78,14 +78,15 @@ class DemonstrationSteps:
         """
         valid = torch.arange(latent.shape[1]) < length.unsqueeze(-1)
         padded = torch.nn.functional.pad(action, (0, 0, 0, 1))
-        if not (latent[valid].isfinite().all() and padded[valid].isfinite().all()):
+        latent, action = latent[valid], padded[valid]
+        if not (latent.isfinite().all() and action.isfinite().all()):
             raise ValueError(
                 "latents or actions of demonstrations are not finite: look for frames or actions "
                 "that are not, or train the encoders again"
             )
         return cls(
-            (latent[valid] * _LATENT_CODES).round().clamp(-127, 127).to(torch.int8),
-            (padded[valid] * _ACTION_CODES).round().clamp(-127, 127).to(torch.int8),
+            (latent * _LATENT_CODES).round().clamp(-127, 127).to(torch.int8),
+            (action * _ACTION_CODES).round().clamp(-127, 127).to(torch.int8),
             length.cumsum(0) - length,
             length.clone(),
             None if joints is None else joints[valid],

@@ -6,7 +6,7 @@ import hashlib
 import json
 import shutil
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from operator import index
 from pathlib import Path
 from typing import Any
@@ -390,8 +390,7 @@ def _check_episodes(
 ) -> tuple[set[str], list[int]]:
     """Return the keys of all episodes and the number of frames of each; warn of doubtful ones."""
     keys: set[str] | None = None
-    lengths, still, again, far = [], list[str](), list[str](), list[str]()
-    known = set[bytes]()
+    lengths, known, doubtful = [], set[bytes](), dict[str, list[str]]()
     for name in episodes:
         if isinstance(episodes[name], Mapping):
             raise ValueError(f"{name!r} has one mapping: give a list of episodes, a mapping each")
@@ -402,26 +401,28 @@ def _check_episodes(
                 lengths.append(check_episode(scene, episode))
             except ValueError as error:
                 raise ValueError(f"episode {number} of {name!r} {error}") from None
-            keys, pixels = set(episode), np.ascontiguousarray(episode["pixels"])
-            if (pixels == pixels[0]).all():
-                still.append(f"{number} of {name!r}")
-            if scene.joints is not None and "joints" in episode:
-                apart = np.asarray(episode["joints"]) - scene.joints.center
-                if (np.abs(apart) > _FAR * np.asarray(scene.joints.scale)).any():
-                    far.append(f"{number} of {name!r}")
-            content = hashlib.sha256(pixels.data).digest()
-            if content in known:
-                again.append(f"{number} of {name!r}")
-            known.add(content)
-    for which, what in (
-        (still, "show one frame throughout: did the camera stand still?"),
-        (again, "have the frames of an earlier one: give each once"),
-        (far, f"have joints farther than {_FAR} scales from their center: is their unit another?"),
-    ):
-        if which:
-            share = f"{len(which)} of {len(lengths)} episodes"
-            warnings.warn(f"{share}, such as {which[0]}, {what}", stacklevel=4)
+            keys = set(episode)
+            for doubt in _doubts(scene, episode, known):
+                doubtful.setdefault(doubt, []).append(f"{number} of {name!r}")
+    for doubt, which in doubtful.items():
+        share = f"{len(which)} of {len(lengths)} episodes"
+        warnings.warn(f"{share}, such as {which[0]}, {doubt}", stacklevel=4)
     return keys or set(), lengths
+
+
+def _doubts(scene: Scene, episode: Mapping[str, Any], known: set[bytes]) -> Iterator[str]:
+    """Yield what is doubtful about an episode, given the digests of the frames of earlier ones."""
+    pixels = np.ascontiguousarray(episode["pixels"])
+    if (pixels == pixels[0]).all():
+        yield "show one frame throughout: did the camera stand still?"
+    content = hashlib.sha256(pixels.data).digest()
+    if content in known:
+        yield "have the frames of an earlier one: give each once"
+    known.add(content)
+    if scene.joints is not None and "joints" in episode:
+        apart = np.abs(np.asarray(episode["joints"]) - scene.joints.center)
+        if (apart > _FAR * np.asarray(scene.joints.scale)).any():
+            yield f"have joints farther than {_FAR} scales from their center: in another unit?"
 
 
 def check_episode(scene: Scene, episode: Mapping[str, Any]) -> int:

@@ -6,7 +6,7 @@ import contextlib
 import importlib
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -63,14 +63,28 @@ def read_film(path: Path) -> Iterator[NDArray[np.uint8]]:
     """
     if not path.exists():
         raise UnreadableError(f"there is no {path}: name a film, or a folder of images")
+    found = False
+    frames = _images_in(path) if path.is_dir() else _decoded(path)
+    for frame in alike(frames, f"the frames in {path}"):
+        found = True
+        yield frame
+    if not found:
+        raise UnreadableError(f"{path} has no frames: name a film, or a folder of images")
+
+
+def alike(frames: Iterable[NDArray[np.uint8]], what: str) -> Iterator[NDArray[np.uint8]]:
+    """Yield frames ``[H, W, 3]`` of one size.
+
+    Raises:
+        UnreadableError: If there are several sizes; ``what`` names the frames.
+    """
     shape = None
-    for frame in _images_in(path) if path.is_dir() else _decoded(path):
+    for frame in frames:
         if shape not in (None, frame.shape):
-            raise UnreadableError(f"the frames in {path} differ in size: make them alike")
+            sizes = f"{[*shape]} and {[*frame.shape]}"
+            raise UnreadableError(f"{what} differ in size, {sizes}: make them alike")
         shape = frame.shape
         yield frame
-    if shape is None:
-        raise UnreadableError(f"{path} has no frames: name a film, or a folder of images")
 
 
 def _images_in(folder: Path) -> Iterator[NDArray[np.uint8]]:

@@ -23,7 +23,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from bgpo_trl.data.dataset import resize_frames
-from bgpo_trl.data.film import UnreadableError, check_depth, decode_image
+from bgpo_trl.data.film import UnreadableError, alike, check_depth, decode_image
 from bgpo_trl.files.writing import new_folder, write_json
 
 try:
@@ -250,7 +250,7 @@ class _Reader:
 
     def _succeeded(self, number: int, column: pd.Series) -> bool:
         """Return whether a frame of an episode says that it succeeded."""
-        flags = [np.asarray(cell).item() for cell in column]
+        flags = _scalars(column).tolist()
         other = [flag for flag in flags if flag is not None and flag not in (0, 1)]
         if other:
             raise ValueError(
@@ -365,18 +365,14 @@ class _Reader:
                 end = self._film_ends[chunk, file]
                 yield from _frames_at(video, start + times, 0.5 / self.fps, end)
             return
-        shape = None
+        yield from alike(self._stored_images(rows), "its images")
+
+    def _stored_images(self, rows: pd.DataFrame) -> Iterator[NDArray[np.uint8]]:
         for file, row in zip(rows["file"], rows["row"], strict=True):
             if self._images[0] != file:
                 column = pq.ParquetFile(file).read([self.image_key]).column(0).to_pylist()
                 self._images = file, column
-            frame = decode_image(self._image(self._images[1][row]))
-            if shape not in (None, frame.shape):
-                raise UnreadableError(
-                    f"its images differ in size, {[*shape]} and {[*frame.shape]}: make them alike"
-                )
-            shape = frame.shape
-            yield frame
+            yield decode_image(self._image(self._images[1][row]))
 
     def _image(self, image: Mapping[str, Any]) -> bytes:
         """Return the content of an image, which is in its row or in a file of the dataset."""

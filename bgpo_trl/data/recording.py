@@ -143,7 +143,9 @@ class _Recorder:
         sequence = np.random.SeedSequence([self.seed, row])
         for attempt in range(1, self.attempts + 1):
             start, noise = (int(child.generate_state(1)[0]) for child in sequence.spawn(2))
-            episode, success = self._perform(task, start, noise, lambda demonstrator: demonstrator)
+            episode, success = perform(
+                self.scene, self.simulation, task, start, noise, lambda demonstrator: demonstrator
+            )
             if success:
                 return episode, attempt
         return None, self.attempts
@@ -171,51 +173,66 @@ class _Recorder:
 
             return act
 
-        return self._perform(task, start, noise, deviate)[0]
+        return perform(self.scene, self.simulation, task, start, noise, deviate)[0]
 
-    def _perform(
-        self, task: str, start: int, noise: int, policy_of: Callable[[_Policy], _Policy]
-    ) -> tuple[dict[str, np.ndarray], bool]:
-        """Return an episode from the start with seed ``start``, and whether it succeeded.
 
-        ``policy_of`` returns the policy that acts, given the demonstrator with that noise.
-        """
-        simulation, scene = self.simulation, self.scene
-        simulation.seed(start)
-        simulation.reset(task)
-        assert scene.demonstrator is not None  # checked before
-        act = policy_of(scene.demonstrator(simulation, task, noise))
-        shape = scene.frame_shape
-        frames, numbers, actions = [checked_frame(simulation, shape)], [self._numbers()], []
-        success = False
-        for _ in range(scene.max_steps):
-            action = np.array(act())  # a copy, since a policy may use its array again
-            if not np.isfinite(action).all():  # what a simulation makes of it is its own
-                raise ValueError(
-                    f"an episode of the demonstrator of {task!r} has an action that is not finite"
-                )
-            success, failure, executed = checked_step(simulation, action)
-            actions.append(executed)
-            frames.append(checked_frame(simulation, shape))
-            numbers.append(self._numbers())
-            if success or failure:
-                break
-        episode = {"pixels": np.stack(frames), "action": np.stack(actions)}
-        episode |= {key: np.stack([moment[key] for moment in numbers]) for key in numbers[0]}
-        try:
-            check_episode(scene, episode)
-        except ValueError as error:
-            raise ValueError(f"an episode of the demonstrator of {task!r} {error}") from None
-        return episode, success
+def perform(
+    scene: Scene,
+    simulation: Simulation,
+    task: str,
+    start: int,
+    noise: int,
+    policy_of: Callable[[_Policy], _Policy],
+) -> tuple[dict[str, np.ndarray], bool]:
+    """Return an episode as for `write_demonstrations`, and whether it succeeded.
 
-    def _numbers(self) -> dict[str, np.ndarray]:
-        """Return ground truth and joints, where the scene has some."""
-        found, scene = dict[str, np.ndarray](), self.scene
-        if scene.state is not None:
-            found["state"] = checked_numbers(self.simulation, "state", scene.state.size)
-        if scene.joints is not None:
-            found["joints"] = checked_numbers(self.simulation, "joints", scene.joints.size)
-        return found
+    Args:
+        scene: The robot, with a demonstrator.
+        simulation: One of its simulations.
+        task: Name of the task.
+        start: Seed of the start.
+        noise: Seed of the demonstrator.
+        policy_of: Returns the policy that acts, given the demonstrator's.
+
+    Raises:
+        ValueError: If an action is not finite, or the simulation returns what `Simulation` does not
+            allow.
+    """
+    simulation.seed(start)
+    simulation.reset(task)
+    assert scene.demonstrator is not None
+    act, shape = policy_of(scene.demonstrator(simulation, task, noise)), scene.frame_shape
+    frames, numbers = [checked_frame(simulation, shape)], [_numbers(scene, simulation)]
+    actions, success = [], False
+    for _ in range(scene.max_steps):
+        action = np.array(act())  # a copy, since a policy may use its array again
+        if not np.isfinite(action).all():  # what a simulation makes of it is its own
+            raise ValueError(
+                f"an episode of the demonstrator of {task!r} has an action that is not finite"
+            )
+        success, failure, executed = checked_step(simulation, action)
+        actions.append(executed)
+        frames.append(checked_frame(simulation, shape))
+        numbers.append(_numbers(scene, simulation))
+        if success or failure:
+            break
+    episode = {"pixels": np.stack(frames), "action": np.stack(actions)}
+    episode |= {key: np.stack([moment[key] for moment in numbers]) for key in numbers[0]}
+    try:
+        check_episode(scene, episode)
+    except ValueError as error:
+        raise ValueError(f"an episode of the demonstrator of {task!r} {error}") from None
+    return episode, success
+
+
+def _numbers(scene: Scene, simulation: Simulation) -> dict[str, np.ndarray]:
+    """Return ground truth and joints, where the scene has some."""
+    found = dict[str, np.ndarray]()
+    if scene.state is not None:
+        found["state"] = checked_numbers(simulation, "state", scene.state.size)
+    if scene.joints is not None:
+        found["joints"] = checked_numbers(simulation, "joints", scene.joints.size)
+    return found
 
 
 def _record_rows(

@@ -36,7 +36,7 @@ from bgpo_trl.scenes import StateColumns
 
 _GOOD_RECONSTRUCTION, _GOOD_NEAREST, _GOOD_INVERSE = 0.5, 0.9, 0.5
 _ALIKE = 0.5  # correlation of actions from which a comparison means something
-_COMPARED = 256  # frames whose colors are compared
+_COMPARED = 256  # frames whose colors are compared, about
 
 
 def probe(
@@ -161,7 +161,7 @@ def complaints(result: Mapping[str, float]) -> list[str]:
 
 @torch.no_grad()
 def mismatches(
-    representation: Representation, dataset: TensorDictBase, latent: Tensor
+    network: FrameNetwork, dataset: TensorDictBase, inferred: Tensor | None
 ) -> list[str]:
     """Return in what demonstrations seem unlike those that encoders were trained on, a line each.
 
@@ -169,20 +169,22 @@ def mismatches(
     and frames with the same frames whose red and blue are exchanged.
 
     Args:
-        representation: The trained encoders.
+        network: The frame encoder.
         dataset: Reads ``pixels``, ``length`` and, if it is there, ``action``.
-        latent: Latents of its frames ``[N, T, F]``.
+        inferred: Actions of the inverse model for its frames ``[N, T - 1, A]``, or None.
     """
-    lines, network, length = [], representation.frame_network, dataset["length"]
-    inverse, recorded = representation.inverse, dataset.get("action", None)
-    if inverse is not None and recorded is not None:
-        lines += _compare_actions(recorded, inverse(latent, length), length)
-    doubt = doubt_colors(network, valid_frames(dataset)[:: max(1, int(length.sum()) // _COMPARED)])
-    return [*lines, doubt] if doubt else lines
+    length, recorded = dataset["length"], dataset.get("action", None)
+    every = max(1, int(length.sum()) // _COMPARED)
+    shown = {key: dataset[key][::every] for key in ("pixels", "length")}
+    some = TensorDict(shown, [len(shown["length"])])
+    doubts = [doubt_colors(network, valid_frames(some)[:_COMPARED])]
+    if inferred is not None and recorded is not None:
+        doubts.append(_doubt_actions(recorded, inferred, length))
+    return [doubt for doubt in doubts if doubt]
 
 
-def _compare_actions(recorded: Tensor, inferred: Tensor, length: Tensor) -> list[str]:
-    """Return in what recorded actions ``[N, T - 1, A]`` differ from inferred ones."""
+def _doubt_actions(recorded: Tensor, inferred: Tensor, length: Tensor) -> str:
+    """Return in what recorded actions ``[N, T - 1, A]`` differ from inferred ones, or ""."""
 
     def correlation(one: Tensor, other: Tensor) -> float:
         return float((one * other).sum() / (one.norm() * other.norm()).clamp_min(1e-9))
@@ -194,18 +196,18 @@ def _compare_actions(recorded: Tensor, inferred: Tensor, length: Tensor) -> list
     early = correlation(recorded[:, :-1][later], inferred[:, 1:][later])
     if max(late, early) > max(now, _ALIKE):
         when = "late" if late > early else "early"
-        return [
+        return (
             f"recorded actions seem to be a step too {when} (correlation with what frames show: "
             f"{now:.2f}, shifted {max(late, early):.2f}): action t leads from frame t to t + 1"
-        ]
+        )
     own = inferred[moves]
     scale = float((recorded[moves] * own).sum() / own.square().sum().clamp_min(1e-9))
     if now > _ALIKE and not 0.5 < scale < 2:
-        return [
+        return (
             f"recorded actions are {scale:.2f} times as large as frames suggest: scale them as "
             "those of the encoders' demonstrations"
-        ]
-    return []
+        )
+    return ""
 
 
 def ridge_predict(x: Tensor, y: Tensor, x_new: Tensor, penalty: float = 1e-4) -> Tensor:

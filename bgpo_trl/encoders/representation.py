@@ -113,6 +113,7 @@ def doubt_colors(network: FrameNetwork, frames: Tensor) -> str:
     """
     if not isinstance(network, VAE):
         return ""
+    frames = frames.to(network.latent_mean.device)
     given, exchanged = (
         (some / 255 - network.decode(network.encode(some)[0])).square().mean()
         for some in (frames, frames.flip(-1))

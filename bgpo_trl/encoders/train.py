@@ -129,12 +129,13 @@ def make_bank(
     """
     length = dataset["length"]
     latent = encode_frames(representation.frame_network, dataset)
-    for mismatch in mismatches(representation, dataset, latent):
+    inverse = representation.inverse
+    inferred = None if inverse is None else inverse(latent, length)
+    for mismatch in mismatches(representation.frame_network, dataset, inferred):
         warnings.warn(mismatch, stacklevel=3)  # of the call before no_grad's
     action = dataset.get("action", None)
     if actions == "inferred" or action is None:
-        inverse = representation.inverse
-        action = None if inverse is None else inverse(latent, length)
+        action = inferred
     train, joints = dataset["train"].clone(), dataset.get("joints", None)
     return DemonstrationBank(
         representation.lae.encode(latent, length),

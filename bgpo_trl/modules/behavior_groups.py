@@ -223,7 +223,10 @@ class BehaviorGroups:
         return self.trials.select(group, others), False
 
     def end(self, group: int, expert: int, *, fits: bool, success: bool) -> None:
-        """Count an episode, given the results of `expert`; join groups that are one task."""
+        """Count an episode, given the results of `expert`; join groups that are one task.
+
+        The episode is that of the demonstration learned last (`adapt`).
+        """
         if {group, expert} <= {*self.numbers}:
             self.trials.count(group, expert, fits=fits, success=success)
         if group == expert:

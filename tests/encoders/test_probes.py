@@ -60,6 +60,7 @@ def test_demonstrations_unlike_those_of_the_encoders_are_told(tmp_path: Path) ->
     dataset = record_demonstrations(tmp_path / "shown", **recording)
     encoders = load_pretrained()[0]
     latent, action = encode_frames(encoders.frame_network, dataset), dataset["action"]
+    inferred = encoders.inverse(latent, dataset["length"])
     none = torch.zeros_like(action[:, :1])
     for changed, said in (
         (action, None),
@@ -68,7 +69,8 @@ def test_demonstrations_unlike_those_of_the_encoders_are_told(tmp_path: Path) ->
         (0.2 * action, "0.20 times as large as frames suggest"),
         (torch.rand_like(action), None),  # which nothing can be told of
     ):
-        found = mismatches(encoders, dataset.clone().update({"action": changed}), latent)
+        changed = dataset.clone().update({"action": changed})
+        found = mismatches(encoders.frame_network, changed, inferred)
         assert [said in line for line in found] == ([] if said is None else [True])
     shown = dataset["pixels"][0, : dataset["length"][0]]
     assert not doubt_colors(encoders.frame_network, shown)

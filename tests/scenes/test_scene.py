@@ -237,7 +237,7 @@ def thrifty(robot, task, seed):
 
 
 def test_arrays_may_be_used_again(tmp_path):
-    """What a simulation or a demonstrator changes later is not what was recorded."""
+    """A recording keeps what a simulation and a demonstrator changed later."""
     options = {"per_task": np.int64(2), "held_out_per_task": 1, "progress": False}
     plain = record_demonstrations(tmp_path / "plain", scene=scene(), **options)
     robot = scene(Thrifty, demonstrator=thrifty)
