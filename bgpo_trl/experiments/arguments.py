@@ -91,6 +91,9 @@ class Arguments(BankArguments):
     them no more."""
     train_encoders: bool = False
     """Record demonstrations and train new encoders instead of using the pretrained ones."""
+    encoder_settings: Path | None = None
+    """With --train-encoders, a YAML or JSON file of the settings that `bgpo encoders --help` lists,
+    such as `vae: {steps: 2000}`; the usual ones for those that it lacks."""
     wandb: Literal["online", "offline"] | None = None
     """Also log means over the seeds to Weights & Biases, in the group EXPERIMENT-ALGORITHM."""
     tensorboard: bool = False
@@ -153,6 +156,8 @@ class EncodersArguments(ImportArguments):
     """Encoders to keep: only their inverse model is trained anew, on play."""
     folder: Path = Path("runs/encoders")
     """Folder for checkpoints, log and probes."""
+    settings: Path | None = None
+    """YAML or JSON file of hyperparameters, such as `vae: {steps: 2000}`; flags change them."""
     config: RepresentationConfig = field(default_factory=RepresentationConfig)
     """Hyperparameters."""
     device: str = "auto"

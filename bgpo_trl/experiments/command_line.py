@@ -20,8 +20,9 @@ from typing import Any, get_type_hints
 
 import tyro
 
-from bgpo_trl.configs import PRESETS
-from bgpo_trl.experiments.arguments import SETTINGS, Arguments
+from bgpo_trl.configs import PRESETS, RepresentationConfig
+from bgpo_trl.experiments.arguments import SETTINGS, Arguments, EncodersArguments
+from bgpo_trl.runs.config_file import read_encoder_settings
 
 
 def command_line(
@@ -139,7 +140,11 @@ def _parse(kind: type, options: Sequence[str] | None, program: str | None, line:
     options = sys.argv[1:] if options is None else options
     parse: Any = partial(tyro.cli, kind, prog=program, description=description, args=options)
     if not issubclass(kind, Arguments):
-        return parse()
+        arguments = parse()
+        if isinstance(arguments, EncodersArguments) and arguments.settings is not None:
+            read = read_encoder_settings(arguments.settings, RepresentationConfig())
+            return parse(default=replace(arguments, config=read))
+        return arguments
     if {"-h", "--help"} & {*options}:
         with contextlib.suppress(SystemExit):
             parse()

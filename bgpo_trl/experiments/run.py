@@ -12,7 +12,7 @@ from shlex import quote
 import torch
 from torchrl.record.loggers.common import Logger
 
-from bgpo_trl.configs import STAGE_PRESETS, RunConfig
+from bgpo_trl.configs import STAGE_PRESETS, RepresentationConfig, RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import load_pretrained, weights_of_bank
 from bgpo_trl.encoders.representation import Representation
@@ -27,7 +27,7 @@ from bgpo_trl.experiments.settings import (
 )
 from bgpo_trl.files.writing import lock_directory, write_json
 from bgpo_trl.machine import choose_device, keep_freed_memory, set_threads
-from bgpo_trl.runs.config_file import Digests, read_config
+from bgpo_trl.runs.config_file import Digests, read_config, read_encoder_settings
 from bgpo_trl.runs.dashboard import tensorboard_logger, wandb_logger
 from bgpo_trl.runs.demonstrations import load_inputs, own_weights
 from bgpo_trl.runs.directory import holds_run
@@ -127,6 +127,10 @@ def _check(arguments: Arguments, config: RunConfig) -> None:
         raise ValueError(
             "--bank and --encoders name what is there: leave them or --train-encoders out"
         )
+    if arguments.encoder_settings is not None and not arguments.train_encoders:
+        raise ValueError(
+            "--encoder-settings: add --train-encoders, which trains encoders with them"
+        )
     if not config.eval_episodes:
         raise ValueError(
             "this command draws figures of tests: set eval_episodes to at least 1, or train "
@@ -182,6 +186,9 @@ def _inputs(
                 "directory"
             )
         return pretrained_for(config.tasks, bank, scene=scene, weights=arguments.encoders)
+    if arguments.encoder_settings is not None:
+        usual = stage.get("config", RepresentationConfig())
+        stage = {**stage, "config": read_encoder_settings(arguments.encoder_settings, usual)}
     encoders, made = make_pretrained(
         own_weights(out),
         out / _DATASET,

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, get_args, get_type_hints
 import yaml
 
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.configs import AlgorithmConfig, RunConfig
+from bgpo_trl.configs import AlgorithmConfig, RepresentationConfig, RunConfig
 from bgpo_trl.scenes import SCENES, find_scene
 
 
@@ -118,6 +118,25 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
             f"{path} cannot be read ({error}): correct it or, for a run, use the version of the "
             "code that made it"
         ) from error
+
+
+def read_encoder_settings(path: Path, defaults: RepresentationConfig) -> RepresentationConfig:
+    """Read settings of encoders from a file that `read_settings` reads.
+
+    Args:
+        path: The file, such as one of ``vae: {steps: 2000}``.
+        defaults: Settings that the file may lack.
+
+    Raises:
+        ValueError: If the file is missing or damaged, or holds a setting unknown or out of range.
+    """
+    if not path.is_file():
+        raise ValueError(f"there is no file of settings {path}")
+    settings = _merged(_as_json(asdict(defaults)), read_settings(path))
+    try:
+        return _built(RepresentationConfig, settings)
+    except ValueError as error:
+        raise ValueError(f"{path} cannot be read ({error}): correct it") from None
 
 
 def settings_of(config: RunConfig, digests: Digests) -> dict[str, Any]:

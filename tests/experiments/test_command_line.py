@@ -86,6 +86,8 @@ CASES = [
     ("bgpo bank absent new", "there is no dataset at absent"),
     ("bgpo encoders empty", "empty is not a dataset"),
     ("bgpo probes empty --weights file", "empty is not a dataset"),
+    ("bgpo encoders empty --settings file", "file must hold settings"),
+    ("bgpo continual --encoder-settings file", "add --train-encoders"),
     # flags, in tyro's box
     ("bgpo continual --presett quick", "--presett"),
     ("bgpo continual --algorithm.betta 0.2", "--algorithm.betta"),

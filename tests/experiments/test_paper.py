@@ -17,6 +17,7 @@ import torch
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis.comparison import NAMES
+from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.experiments.report import ReportArguments, report
@@ -256,6 +257,24 @@ def test_a_run_that_was_interrupted_while_it_made_encoders_is_resumed(
     assert [path.name for path in tmp_path.iterdir()] == ["demonstrations"]
     continual(replace(arguments, train_encoders=True))
     assert (tmp_path / "summary.json").exists()
+
+
+def test_new_encoders_are_trained_with_the_settings_of_a_file(
+    undrawn, tmp_path, monkeypatch, encoders, bank
+):
+    trained = []
+
+    def make(*_, config, **__):
+        trained.append(config)
+        return encoders, bank
+
+    monkeypatch.setattr(experiment, "make_pretrained", make)
+    (path := tmp_path / "mine.yaml").write_text("vae: {steps: 7}\ninverse: {largest_action: 2}")
+    arguments = Arguments(out=tmp_path / "run", episodes=2, train_encoders=True)
+    continual(replace(arguments, encoder_settings=path))
+    usual = RepresentationConfig()
+    vae, inverse = replace(usual.vae, steps=7), replace(usual.inverse, largest_action=2.0)
+    assert trained == [replace(usual, vae=vae, inverse=inverse)]
 
 
 def test_a_task_is_added_to_a_finished_run_and_reported(undrawn, tmp_path, encoders, bank):

@@ -2,15 +2,17 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import yaml
 
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.configs import PRESETS
-from bgpo_trl.experiments.arguments import Arguments
+from bgpo_trl.configs import PRESETS, RepresentationConfig
+from bgpo_trl.experiments.arguments import Arguments, EncodersArguments
+from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.experiments.settings import at_once, run_config
-from bgpo_trl.runs.config_file import Digests, read_config, settings_of
+from bgpo_trl.runs.config_file import Digests, read_config, read_encoder_settings, settings_of
 from suites import nico
 
 ONE, TWO, THREE = nico.PAPER_TASKS
@@ -87,6 +89,39 @@ def test_a_file_changes_the_preset_and_flags_change_the_file(tmp_path):
     assert run_config(flags) == changed
     other = run_config(replace(of_file, algorithm="maml"))
     assert (other.name, other.algorithm) == ("maml", ALGORITHMS["maml"].config)
+
+
+def test_a_file_sets_what_encoders_train_with_and_flags_change_the_file(tmp_path):
+    (path := tmp_path / "mine.yaml").write_text("seed: 3\nvae: {steps: 7, kl_weight: 1e-3}")
+    found: list[EncodersArguments] = []
+
+    def encoders(arguments: EncodersArguments) -> None:
+        found.append(arguments)
+
+    flags = ["shown", "played", "--settings", str(path), "--config.vae.steps", "9", "--folder", "f"]
+    command_line(encoders, flags)
+    usual = RepresentationConfig()
+    config = replace(usual, seed=3, vae=replace(usual.vae, steps=9, kl_weight=1e-3))
+    expected = EncodersArguments(
+        dataset=Path("shown"), play=Path("played"), settings=path, config=config, folder=Path("f")
+    )
+    assert found == [expected]
+
+
+@pytest.mark.parametrize(
+    ("content", "cause"),
+    [
+        ("vae: {stepps: 7}", "unknown setting vae.stepps"),
+        ("vae: {steps: 0}", "vae: steps must be at least 1"),
+        ("steps: 7", "unknown setting steps"),
+        ("vae: 7", "vae"),
+    ],
+)
+def test_a_wrong_file_of_encoder_settings_is_refused(tmp_path, content, cause):
+    (path := tmp_path / "mine.yaml").write_text(content)
+    with pytest.raises(ValueError, match=cause) as error:
+        read_encoder_settings(path, RepresentationConfig())
+    assert str(path) in str(error.value)
 
 
 YAML = """
