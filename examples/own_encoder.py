@@ -31,8 +31,7 @@ OUT, TASKS = Path("runs/own-encoder"), ("grasp_glass", "push_green_to_glass")
 class RandomPlaces(FrameNetwork):
     """Expected places under the softmax of 32 random maps of a frame, hence 64 numbers.
 
-    A network of torchvision or timm goes in the same way: make it here without its last layer, such
-    as ``timm.create_model("resnet18", pretrained=True, num_classes=0)``, whose latent_size is 512.
+    `examples/torchvision_encoder.py` does the same with a network of torchvision.
     """
 
     identity = "random-places 1"  # Change the version if the same weights give other features.

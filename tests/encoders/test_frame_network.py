@@ -1,5 +1,6 @@
 """A frame network of one's own in place of the VAE: other encoders on its vectors, files, runs."""
 
+import importlib
 import json
 from dataclasses import replace
 from functools import partial
@@ -27,6 +28,7 @@ from tests.scenes.dot import SavedDot, scene
 NAME = "columns"
 TINY = replace(TINY_ENCODERS, frame_network=NAME, checkpoint_every=1, log_every=2)
 DOT = scene(SavedDot)
+OPERATORS = []  # which are there as long as their library
 
 
 class Columns(FrameNetwork):
@@ -117,6 +119,44 @@ def test_a_file_holds_it_and_its_module_makes_it_again(tmp_path):
     assert not read.frame_network.training
     with pytest.raises(ValueError, match=r"has frames of \[16, 24\] .* the scene \[16, 26\]"):
         load_representation(path, scene=replace(DOT, frame_shape=(16, 26)))
+
+
+@pytest.fixture(scope="module")
+def torchvision_encoder():
+    """The module of the example.
+
+    PyPI's torchvision is built for CUDA's torch. Beside a build for CPUs alone, its own operators
+    are lacking, which the import expects to be there. No network of convolutions calls them.
+    """
+    try:
+        return importlib.import_module("examples.torchvision_encoder")
+    except RuntimeError:
+        operators = torch.library.Library("torchvision", "DEF")
+        for name in ("nms", "qnms"):
+            operators.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+        OPERATORS.append(operators)
+    return importlib.import_module("examples.torchvision_encoder")
+
+
+def test_a_network_of_torchvision_is_frozen_and_comes_back_from_its_file(
+    tmp_path, torchvision_encoder
+):
+    FRAME_NETWORKS["resnet18-places"] = torchvision_encoder.ResNet18Places
+    encoders, path = train(config=replace(TINY, frame_network="resnet18-places")), tmp_path / "file"
+    network = encoders.frame_network
+    assert type(network) is torchvision_encoder.ResNet18Places and network.latent_size == 128
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(TINY.seed)
+        untrained = torchvision_encoder.ResNet18Places((16, 24)).state_dict()
+    # The running means of its batch norms, too.
+    for name, weights in network.first_stage.state_dict().items():
+        assert weights.equal(untrained[f"first_stage.{name}"])
+    save_representation(encoders, path)
+    read = load_representation(path, scene=DOT)
+    frames = movies()["pixels"][:, 0]
+    latent = read.frame_network.latent(frames)
+    assert latent.equal(network.latent(frames)) and latent.std(0).min() > 0
+    torch.testing.assert_close(read.frame_network.latent(frames[3:4]), latent[3:4])
 
 
 def test_a_file_whose_network_no_module_adds_or_in_another_version_is_refused(tmp_path, refused):
