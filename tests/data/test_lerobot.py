@@ -23,13 +23,14 @@ pa = pytest.importorskip("pyarrow")
 
 import pyarrow.parquet as pq  # noqa: E402
 
-from bgpo_trl.data import lerobot  # noqa: E402
+from bgpo_trl.data import lerobot_export  # noqa: E402
 from bgpo_trl.data.dataset import (  # noqa: E402
     resize_frames,
     write_demonstrations,
     write_logged_episodes,
 )
-from bgpo_trl.data.lerobot import read_lerobot, write_lerobot  # noqa: E402
+from bgpo_trl.data.lerobot import read_lerobot  # noqa: E402
+from bgpo_trl.data.lerobot_export import write_lerobot  # noqa: E402
 from tests.helpers import edit  # noqa: E402
 
 TASKS = ("grasp_glass", "push_green_to_white")
@@ -123,8 +124,8 @@ def test_statistics_are_those_of_all_frames(written):
 
 
 def test_long_datasets_are_spread_over_several_files(tmp_path, monkeypatch):
-    monkeypatch.setattr(lerobot, "_FILE_BYTES", 1)
-    monkeypatch.setattr(lerobot, "_FILES_PER_CHUNK", 2)
+    monkeypatch.setattr(lerobot_export, "_FILE_BYTES", 1)
+    monkeypatch.setattr(lerobot_export, "_FILES_PER_CHUNK", 2)
     path = tmp_path / "many"
     write_lerobot(path, dataset_of(), tasks=TASKS, fps=5)
     rows = pq.read_table(path / EPISODES).to_pylist()

@@ -12,7 +12,8 @@ from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
-from bgpo_trl.data.lerobot import read_lerobot, write_lerobot
+from bgpo_trl.data.lerobot import read_lerobot
+from bgpo_trl.data.lerobot_export import write_lerobot
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.train import make_bank, train_encoders
 from bgpo_trl.experiments.watch import WatchArguments, watch
