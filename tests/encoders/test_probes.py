@@ -9,10 +9,12 @@ from tensordict import TensorDict
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.probes import (
+    complaints,
     mismatches,
     probe,
     reconstruction_picture,
     ridge_predict,
+    share_lost,
 )
 from bgpo_trl.encoders.representation import Representation, doubt_colors, encode_frames
 from bgpo_trl.encoders.train import make_bank
@@ -129,3 +131,28 @@ def test_frames_of_play_with_a_fallen_object_are_left_out(untrained: Representat
     assert result.items() >= probe(untrained, demonstrations(), columns=NICO.state).items()
     assert 0.01 < result["play_joint_yaw_rmse_rad"] < 10
     assert result["play_white_error_cm"] == pytest.approx(0, abs=1e-2)
+
+
+def test_a_small_thing_that_is_lost_counts_as_much_as_a_large_one_that_is_seen():
+    background = torch.zeros(20, 30, 3)
+    frames = background.repeat(4, 1, 1, 1)
+    frames[:, 2:12, 2:12] = 0.8  # the robot
+    frames[:3, 15:17, 20:22, 0] = 1.0  # an object of four pixels
+    frames[3, 15, 20] = 1.0  # too small for a thing
+    frames[:, 18, 1:9] = 0.1  # too faint
+    assert share_lost(frames, frames, background) == 0
+    seen = frames.clone()
+    seen[:3, 15:17, 20:22] = 0
+    assert share_lost(frames, seen, background) == 3 / 7
+    seen[0, 15:17, 20:22, 0] = 0.4  # of its squared difference, .64 is reconstructed
+    assert share_lost(frames, seen, background) == 2 / 7
+    assert share_lost(frames, background.expand_as(frames), background) == 1
+    assert share_lost(background[None], background[None], background) == 0
+
+
+def test_things_that_are_lost_are_complained_of():
+    good = {"task_accuracy_nearest": 1.0, "task_accuracy_chance": 0.5}
+    seen = {**good, "moving_reconstruction": 0.6}
+    assert complaints({**seen, "things_lost": 0.08}) == []
+    (line,) = complaints({**seen, "things_lost": 0.47})
+    assert line.startswith("47 % of the things that stand out in frames are not reconstructed")
