@@ -87,6 +87,18 @@ def choose_device(name: str = "auto") -> torch.device:
     return device
 
 
+def has_bfloat16(device: torch.device) -> bool:
+    """Return whether a device computes in bfloat16; a CPU that emulates it takes ten times as long.
+
+    What is neither a CPU nor a GPU of CUDA is believed to.
+    """
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    if device.type == "cpu" and torch.backends.mkldnn.is_available():
+        return torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    return True
+
+
 class RowPool:
     """Threads that share the rows of a batch; the caller's is one of ``n``.
 

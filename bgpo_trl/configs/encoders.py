@@ -45,7 +45,8 @@ class VAEConfig(FitConfig):
     steps: int = 4_000
     """Gradient steps. Ours: not given in the paper."""
     bfloat16: bool = False
-    """Whether to compute in bfloat16, which halves the time on processors and GPUs that have it."""
+    """Whether to compute in bfloat16, which halves the time on processors and GPUs that have it;
+    others compute in float32."""
     reconstruction_weight: float = 1.0
     """Factor of the squared error summed over a frame. Ours: the unit of the other weights."""
     kl_weight: float = 0.01

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -34,6 +35,7 @@ from bgpo_trl.encoders.representation import (
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.tensor_file import digest
+from bgpo_trl.machine import has_bfloat16
 from bgpo_trl.modules.frame_network import FrameNetwork, make_frame_network
 from bgpo_trl.modules.inverse_model import InverseModel, window
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
@@ -327,7 +329,11 @@ def _train_vae(datasets: Sequence[TensorDictBase], fit: Fit) -> VAE:
         inverse_weight=config.inverse_weight,
         generator=generator,
     )
-    fit("vae", vae, loss_of, sample, generator, config.bfloat16)
+    bfloat16 = config.bfloat16 and has_bfloat16(torch.device(fit.device))
+    if config.bfloat16 and not bfloat16:
+        emulated = "this processor only emulates bfloat16, ten times slower: computing in float32"
+        warnings.warn(emulated, stacklevel=2)
+    fit("vae", vae, loss_of, sample, generator, bfloat16)
     vae.eval().requires_grad_(False)
     _set_scale(vae, frames, fit)
     return vae

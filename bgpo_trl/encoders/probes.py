@@ -8,9 +8,10 @@ part of the encoders' training reads the ground-truth ``state``.
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib.image
 import numpy as np
@@ -169,6 +170,47 @@ def complaints(result: Mapping[str, float]) -> list[str]:
             "play, train longer (inverse.steps), or use recorded actions (bank_actions)"
         )
     return [line.replace("%", " %") for line in lines]
+
+
+def verdict(result: Mapping[str, float]) -> str:
+    """Return a table of what `complaints` judges.
+
+    Args:
+        result: Result of `probe`.
+
+    Examples:
+        >>> print(verdict({"task_accuracy_nearest": 1.0, "things_lost": 0.2}))
+        things in frames that are not reconstructed  0.20  at most 0.10   too many
+        nearest demonstration is of the same task    1.00  at least 0.90  ok
+    """
+    rows = [
+        (
+            "what moves in frames and is reconstructed",
+            "moving_reconstruction",
+            _GOOD_RECONSTRUCTION,
+        ),
+        ("things in frames that are not reconstructed", "things_lost", -_MANY_LOST),
+        ("nearest demonstration is of the same task", "task_accuracy_nearest", _GOOD_NEAREST),
+        ("inferred actions, R2", "inverse_r2", _GOOD_INVERSE),
+    ]
+    lines = []
+    for name, key, bound in rows:
+        if key in result:
+            asked = f"at most {-bound:.2f}" if bound < 0 else f"at least {bound:.2f}"
+            wrong = "too many" if bound < 0 else "too low"
+            good = result[key] <= -bound if bound < 0 else result[key] >= bound
+            lines.append(f"{name:<43}  {result[key]:.2f}  {asked:<13}  {'ok' if good else wrong}")
+    return "\n".join(lines)
+
+
+def verdict_in(folder: Path) -> str:
+    """Return the `verdict` of the probes that `probe` wrote into a folder, and its picture."""
+    found, picture = (
+        json.loads((folder / "probes.json").read_text()),
+        folder / "reconstructions.png",
+    )
+    looked = f"\nlook for every object in {picture}" if picture.exists() else ""
+    return f"{verdict(found)}{looked}"
 
 
 @torch.no_grad()
@@ -394,9 +436,9 @@ def share_lost(frames: Tensor, decoded: Tensor, background: Tensor) -> float:
     error = (frames - decoded).square().sum(-1)
     lost = []
     for picture, left in zip(apart.numpy(), error.numpy(), strict=True):
-        things, n_things = ndimage.label(picture >= 3 * _STANDS_OUT**2, np.ones((3, 3)))
+        things: Any = ndimage.label(picture >= 3 * _STANDS_OUT**2, np.ones((3, 3)))
         sizes, shown, missed = (
-            ndimage.sum_labels(values, things, range(1, n_things + 1))
+            ndimage.sum_labels(values, things[0], range(1, things[1] + 1))
             for values in (np.ones_like(picture), picture, left)
         )
         lost.append((missed > 0.5 * shown)[sizes >= _THING])

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from bgpo_trl.data.dataset import load_demonstrations, read_meta
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.pretrained import default_weights
-from bgpo_trl.encoders.probes import probe
+from bgpo_trl.encoders.probes import probe, verdict_in
 from bgpo_trl.encoders.representation import load_representation
 from bgpo_trl.encoders.train import make_bank, train_encoders
 from bgpo_trl.experiments.arguments import (
@@ -29,7 +29,7 @@ def record(arguments: RecordArguments) -> None:
     record_demonstrations(**options)
 
 
-def encoders(arguments: EncodersArguments) -> None:
+def encoders(arguments: EncodersArguments) -> str:
     """Train both encoders on recordings, and embed these; see `train_encoders`."""
     dataset, meta = load_demonstrations(arguments.dataset), read_meta(arguments.dataset)
     scene, weights, keep = find_scene(meta["scene"]), arguments.weights, arguments.keep
@@ -46,6 +46,7 @@ def encoders(arguments: EncodersArguments) -> None:
         spread=meta["spread"],
         keep=None if keep is None else load_representation(keep, scene=scene),
     )
+    return verdict_in(arguments.folder)
 
 
 def _play(path: Path, scene: Scene) -> TensorDict:
@@ -71,7 +72,7 @@ def bank(arguments: MakeBankArguments) -> None:
     made.save(arguments.out)
 
 
-def probes(arguments: ProbesArguments) -> None:
+def probes(arguments: ProbesArguments) -> str:
     """Evaluate trained encoders with probes; see `probe`."""
     meta, weights = read_meta(arguments.dataset), arguments.weights
     scene = find_scene(meta["scene"])
@@ -80,3 +81,4 @@ def probes(arguments: ProbesArguments) -> None:
     play = None if arguments.play is None else _play(arguments.play, scene)
     dataset = load_demonstrations(arguments.dataset)
     probe(representation, dataset, arguments.out, play=play, columns=scene.state)
+    return verdict_in(arguments.out)

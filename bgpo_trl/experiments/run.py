@@ -15,6 +15,7 @@ from torchrl.record.loggers.common import Logger
 from bgpo_trl.configs import STAGE_PRESETS, RepresentationConfig, RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import load_pretrained, weights_of_bank
+from bgpo_trl.encoders.probes import verdict_in
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.experiments.arguments import Arguments, BankArguments
@@ -116,6 +117,8 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
             # Written last, as the mark of a complete run.
             write_json(out / "summary.json", summary)
     lines += [verdict] if verdict else []
+    if arguments.train_encoders and (out / "encoders" / "probes.json").exists():
+        lines.append(f"its encoders:\n{verdict_in(out / 'encoders')}")
     return "\n".join(
         [*lines, f"curve and figures: {out}; in numbers: bgpo report {quote(str(out))}"]
     )

@@ -17,6 +17,7 @@ from bgpo_trl.configs import (
     SequenceAutoencoderConfig,
     VAEConfig,
 )
+from bgpo_trl.encoders import fitting
 from bgpo_trl.encoders.fitting import retrain_inverse, train_representation
 from bgpo_trl.encoders.probes import _probe_reconstruction, probe
 from bgpo_trl.encoders.representation import (
@@ -323,3 +324,10 @@ def test_configurations_and_datasets_that_cannot_be_trained_on_are_refused() -> 
     shown = squares(8).set("train", torch.ones(8, dtype=torch.bool))
     with pytest.raises(ValueError, match=r"the dataset has no held-out .* held_out_per_task of at"):
         train(shown)
+
+
+def test_bfloat16_is_left_out_where_it_would_be_emulated(monkeypatch, tiny):
+    monkeypatch.setattr(fitting, "has_bfloat16", lambda _: False)
+    with pytest.warns(UserWarning, match="emulates bfloat16"):
+        other = train(squares(8), replace(TINY, vae=replace(TINY.vae, bfloat16=True)))
+    assert other.identity == tiny.identity
