@@ -22,7 +22,6 @@ import tyro
 
 from bgpo_trl.configs import PRESETS, RepresentationConfig
 from bgpo_trl.experiments.arguments import SETTINGS, Arguments, EncodersArguments
-from bgpo_trl.runs.config_file import read_encoder_settings
 
 
 def command_line(
@@ -142,6 +141,9 @@ def _parse(kind: type, options: Sequence[str] | None, program: str | None, line:
     if not issubclass(kind, Arguments):
         arguments = parse()
         if isinstance(arguments, EncodersArguments) and arguments.settings is not None:
+            # Here, since help and messages need no torch.
+            from bgpo_trl.runs.config_file import read_encoder_settings
+
             read = read_encoder_settings(arguments.settings, RepresentationConfig())
             return parse(default=replace(arguments, config=read))
         return arguments
