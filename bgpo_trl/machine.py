@@ -88,15 +88,13 @@ def choose_device(name: str = "auto") -> torch.device:
 
 
 def has_bfloat16(device: torch.device) -> bool:
-    """Return whether a device computes in bfloat16; a CPU that emulates it takes ten times as long.
+    """Return whether a CPU or a GPU of CUDA has instructions for bfloat16, rather than emulates it.
 
-    What is neither a CPU nor a GPU of CUDA is believed to.
+    Of CPUs, those of x86 with AVX-512 are known to. Other kinds of devices are believed to.
     """
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
-    if device.type == "cpu" and torch.backends.mkldnn.is_available():
-        return torch.ops.mkldnn._is_mkldnn_bf16_supported()
-    return True
+    return device.type != "cpu" or torch.cpu._is_avx512_bf16_supported()
 
 
 class RowPool:

@@ -10,7 +10,7 @@ import threading
 import pytest
 import torch
 
-from bgpo_trl.machine import RowPool, choose_device, usable_cores
+from bgpo_trl.machine import RowPool, choose_device, has_bfloat16, usable_cores
 
 CORES = len(os.sched_getaffinity(0))
 
@@ -120,3 +120,11 @@ def test_a_copy_has_its_own_threads(threads):
     copy.each(range(5), lambda row: row**2, results.__setitem__)
     assert results == {row: row**2 for row in range(5)}
     copy.close()
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_bfloat16_is_asked_of_the_device(monkeypatch, there):
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: there)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: not there)
+    found = [has_bfloat16(torch.device(kind)) for kind in ("cpu", "cuda", "mps")]
+    assert found == [there, not there, True]

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from shared import TrainedArguments, load_blocks, write_measurement
 from torch import Tensor
 
+from bgpo_trl.analysis.statistics import mean
 from bgpo_trl.analysis.tables import markdown
 from bgpo_trl.evaluation import Snapshot, evaluator_of, snapshots_of
 from bgpo_trl.experiments.command_line import command_line
@@ -114,8 +115,9 @@ def _changed(snapshot: Snapshot, change: Callable[[Weights], Weights]) -> Snapsh
 def trained(arguments: TrainedArguments) -> str:
     """Test trained policies often, and the clone, the actor and the critics' choice alone.
 
-    Prints a table of success (%) and steps of a success, means over seeds; writes trained.csv and
-    trained.json (commit and command) into the run directory.
+    Prints a table of success (%) and steps of a success, means over seeds, and in points what the
+    policy of the tests has above the clone, paired by seed; writes trained.csv and trained.json
+    (commit and command) into the run directory.
 
     Raises:
         ValueError: If the run cannot be loaded, or ``episodes`` is less than 1.
@@ -131,10 +133,21 @@ def trained(arguments: TrainedArguments) -> str:
             rows += measure_trained(run, arguments.episodes, bar.update)
     table = pd.DataFrame(rows)
     write_measurement(out, "trained", table, commit)
+    return summarized(table)
+
+
+def summarized(table: pd.DataFrame) -> str:
+    """Return means over seeds of rows of `measure_trained`, as a table of success and steps."""
     tasks, names = [*table["task"].unique()], [*table["policy"].unique()]
     means = table.groupby(["task", "policy"])[["success", "steps"]].mean()
-    rows_of = [[task, *map(_cell, means.loc[task].loc[names].to_numpy())] for task in tasks]
-    return markdown([["task", *names], *rows_of])
+    rows = [[task, *map(_cell, means.loc[task].loc[names].to_numpy())] for task in tasks]
+    if len(names) > 1:
+        names.append("above clone")
+        success = table.pivot(index=["task", "seed"], columns="policy", values="success")
+        above = success["as in tests"] - success["clone alone"]
+        for task, cells in zip(tasks, rows, strict=True):
+            cells.append(mean(above.loc[task]).points())
+    return markdown([["task", *names], *rows])
 
 
 def _cell(means: NDArray[np.float64]) -> str:

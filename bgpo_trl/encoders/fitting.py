@@ -331,7 +331,7 @@ def _train_vae(datasets: Sequence[TensorDictBase], fit: Fit) -> VAE:
     )
     bfloat16 = config.bfloat16 and has_bfloat16(torch.device(fit.device))
     if config.bfloat16 and not bfloat16:
-        emulated = "this processor only emulates bfloat16, ten times slower: computing in float32"
+        emulated = "this processor has no instructions for bfloat16: computing in float32"
         warnings.warn(emulated, stacklevel=2)
     fit("vae", vae, loss_of, sample, generator, bfloat16)
     vae.eval().requires_grad_(False)

@@ -35,9 +35,8 @@ from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.objectives.supervised import sequence_reconstruction_loss
-from bgpo_trl.scenes import StateColumns
+from bgpo_trl.scenes import Scene, StateColumns
 
-_GOOD_RECONSTRUCTION, _GOOD_NEAREST, _GOOD_INVERSE, _MANY_LOST = 0.5, 0.9, 0.5, 0.1
 _SEARCHED = 300  # frames in which things are looked for
 _STANDS_OUT, _THING = 0.15, 4  # deviation of a pixel in the range of colors; least pixels
 _ALIKE = 0.5  # correlation of actions from which a comparison means something
@@ -129,6 +128,74 @@ def _encoded(network: FrameNetwork, dataset: TensorDictBase, *name: str) -> list
     return parts
 
 
+class _Check(NamedTuple):
+    """A result of `probe` that says whether encoders are good.
+
+    Attributes:
+        key: Of the result.
+        name: Of the row in the `verdict`.
+        bound: Least good value or, of a share of errors, the largest.
+        complaint: What to do if it is not good, a format of all results.
+        of_errors: Whether smaller values are better.
+    """
+
+    key: str
+    name: str
+    bound: float
+    complaint: str
+    of_errors: bool = False
+
+    def passes(self, result: Mapping[str, float]) -> bool:
+        value = result[self.key]
+        return value <= self.bound if self.of_errors else value >= self.bound
+
+
+_CHECKS = (
+    _Check(
+        "moving_reconstruction",
+        "what moves in frames and is reconstructed",
+        0.5,
+        "encoders reconstruct {moving_reconstruction:.0%} of what moves in frames: look for the "
+        "objects in reconstructions.png; train longer (vae.steps), lower vae.kl_weight, or show "
+        "them larger",
+    ),
+    _Check(
+        "things_lost",
+        "things in frames that are not reconstructed",
+        0.1,
+        "{things_lost:.0%} of the things that stand out in frames are not reconstructed, so "
+        "policies will not see them: look for them in reconstructions.png; train longer "
+        "(vae.steps), lower vae.kl_weight, or show them larger",
+        of_errors=True,
+    ),
+    _Check(
+        "task_accuracy_nearest",
+        "nearest demonstration is of the same task",
+        0.9,
+        "{task_accuracy_nearest:.0%} of the held-out demonstrations are nearest to one of their "
+        "own task, {task_accuracy_chance:.0%} by chance: groups of behaviors will mix tasks; show "
+        "objects larger, train longer (vae.steps, lae.steps), or record more demonstrations, or "
+        "play",
+    ),
+    _Check(
+        "inverse_r2",
+        "inferred actions, R2",
+        0.5,
+        "actions inferred from frames have an R2 of {inverse_r2:.2f}: record more play, train "
+        "longer (inverse.steps), or use recorded actions (bank_actions)",
+    ),
+)
+
+
+def judged(result: Mapping[str, float], scene: Scene) -> dict[str, float]:
+    """Return the results of `probe` that encoders of a scene are judged by.
+
+    Inferred actions are good for nothing else than banks, and left out if these have recorded ones.
+    """
+    unused = {"inverse_r2"} if scene.bank_actions == "recorded" else set[str]()
+    return {key: value for key, value in result.items() if key not in unused}
+
+
 def complaints(result: Mapping[str, float]) -> list[str]:
     """Return what is not good about encoders, a line each with what to do; none if all is good.
 
@@ -144,32 +211,8 @@ def complaints(result: Mapping[str, float]) -> list[str]:
         encoders reconstruct 31 % of what moves in frames: look for the objects in
         reconstructions.png; train longer (vae.steps), lower vae.kl_weight, or show them larger
     """
-    nearest, chance = result["task_accuracy_nearest"], result["task_accuracy_chance"]
-    lines = []
-    if result.get("moving_reconstruction", 1.0) < _GOOD_RECONSTRUCTION:
-        lines.append(
-            f"encoders reconstruct {result['moving_reconstruction']:.0%} of what moves in frames: "
-            "look for the objects in reconstructions.png; train longer (vae.steps), lower "
-            "vae.kl_weight, or show them larger"
-        )
-    elif result.get("things_lost", 0.0) > _MANY_LOST:
-        lines.append(
-            f"{result['things_lost']:.0%} of the things that stand out in frames are not "
-            "reconstructed, so policies will not see them: look for them in reconstructions.png; "
-            "train longer (vae.steps), lower vae.kl_weight, or show them larger"
-        )
-    if chance < 1 and nearest < _GOOD_NEAREST:
-        lines.append(
-            f"{nearest:.0%} of the held-out demonstrations are nearest to one of their own task, "
-            f"{chance:.0%} by chance: groups of behaviors will mix tasks; show objects larger, "
-            "train longer (vae.steps, lae.steps), or record more demonstrations, or play"
-        )
-    if result.get("inverse_r2", 1.0) < _GOOD_INVERSE:
-        lines.append(
-            f"actions inferred from frames have an R2 of {result['inverse_r2']:.2f}: record more "
-            "play, train longer (inverse.steps), or use recorded actions (bank_actions)"
-        )
-    return [line.replace("%", " %") for line in lines]
+    wrong = [check for check in _CHECKS if check.key in result and not check.passes(result)]
+    return [check.complaint.format(**result).replace("%", " %") for check in wrong]
 
 
 def verdict(result: Mapping[str, float]) -> str:
@@ -180,37 +223,24 @@ def verdict(result: Mapping[str, float]) -> str:
 
     Examples:
         >>> print(verdict({"task_accuracy_nearest": 1.0, "things_lost": 0.2}))
-        things in frames that are not reconstructed  0.20  at most 0.10   too many
+        things in frames that are not reconstructed  0.20  at most 0.10   not good
         nearest demonstration is of the same task    1.00  at least 0.90  ok
     """
-    rows = [
-        (
-            "what moves in frames and is reconstructed",
-            "moving_reconstruction",
-            _GOOD_RECONSTRUCTION,
-        ),
-        ("things in frames that are not reconstructed", "things_lost", -_MANY_LOST),
-        ("nearest demonstration is of the same task", "task_accuracy_nearest", _GOOD_NEAREST),
-        ("inferred actions, R2", "inverse_r2", _GOOD_INVERSE),
-    ]
     lines = []
-    for name, key, bound in rows:
-        if key in result:
-            asked = f"at most {-bound:.2f}" if bound < 0 else f"at least {bound:.2f}"
-            wrong = "too many" if bound < 0 else "too low"
-            good = result[key] <= -bound if bound < 0 else result[key] >= bound
-            lines.append(f"{name:<43}  {result[key]:.2f}  {asked:<13}  {'ok' if good else wrong}")
+    for check in _CHECKS:
+        if check.key in result:
+            asked = f"at {'most' if check.of_errors else 'least'} {check.bound:.2f}"
+            found = "ok" if check.passes(result) else "not good"
+            lines.append(f"{check.name:<43}  {result[check.key]:.2f}  {asked:<13}  {found}")
     return "\n".join(lines)
 
 
-def verdict_in(folder: Path) -> str:
-    """Return the `verdict` of the probes that `probe` wrote into a folder, and its picture."""
-    found, picture = (
-        json.loads((folder / "probes.json").read_text()),
-        folder / "reconstructions.png",
-    )
-    looked = f"\nlook for every object in {picture}" if picture.exists() else ""
-    return f"{verdict(found)}{looked}"
+def verdict_in(folder: Path, scene: Scene) -> str:
+    """Return the `verdict` of what `probe` wrote into a folder, with the path of its picture."""
+    result = json.loads((folder / "probes.json").read_text())
+    picture = folder / "reconstructions.png"
+    look = f"\nlook for every object in {picture}" if picture.exists() else ""
+    return f"{verdict(judged(result, scene))}{look}"
 
 
 @torch.no_grad()

@@ -17,7 +17,7 @@ from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.fitting import Log, retrain_inverse, train_representation
 from bgpo_trl.encoders.pretrained import bank_path
-from bgpo_trl.encoders.probes import complaints, mismatches, probe
+from bgpo_trl.encoders.probes import complaints, judged, mismatches, probe
 from bgpo_trl.encoders.representation import (
     Representation,
     encode_frames,
@@ -96,9 +96,7 @@ def train_encoders(
     bank.save(bank_path(weights))
     play = None if keep else play
     found = probe(representation, dataset, folder, play=play, columns=scene.state)
-    # Actions of the inverse model are good for nothing else than banks.
-    unused = {"inverse_r2"} if actions == "recorded" else set[str]()
-    for complaint in complaints({key: found[key] for key in found if key not in unused}):
+    for complaint in complaints(judged(found, scene)):
         warnings.warn(f"{complaint} ({folder})", stacklevel=2)
     return representation, bank
 

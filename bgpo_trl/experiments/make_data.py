@@ -46,7 +46,7 @@ def encoders(arguments: EncodersArguments) -> str:
         spread=meta["spread"],
         keep=None if keep is None else load_representation(keep, scene=scene),
     )
-    return verdict_in(arguments.folder)
+    return verdict_in(arguments.folder, scene)
 
 
 def _play(path: Path, scene: Scene) -> TensorDict:
@@ -81,4 +81,4 @@ def probes(arguments: ProbesArguments) -> str:
     play = None if arguments.play is None else _play(arguments.play, scene)
     dataset = load_demonstrations(arguments.dataset)
     probe(representation, dataset, arguments.out, play=play, columns=scene.state)
-    return verdict_in(arguments.out)
+    return verdict_in(arguments.out, scene)

@@ -117,8 +117,9 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
             # Written last, as the mark of a complete run.
             write_json(out / "summary.json", summary)
     lines += [verdict] if verdict else []
-    if arguments.train_encoders and (out / "encoders" / "probes.json").exists():
-        lines.append(f"its encoders:\n{verdict_in(out / 'encoders')}")
+    if arguments.train_encoders:
+        of_encoders = verdict_in(own_weights(out).parent, find_scene(config.scene))
+        lines.append(f"its encoders:\n{of_encoders}")
     return "\n".join(
         [*lines, f"curve and figures: {out}; in numbers: bgpo report {quote(str(out))}"]
     )
@@ -195,7 +196,7 @@ def _inputs(
     encoders, made = make_pretrained(
         own_weights(out),
         out / _DATASET,
-        folder=out / "encoders",
+        folder=own_weights(out).parent,
         command=command(),
         device=device,
         tasks=config.tasks,

@@ -8,7 +8,7 @@ from torch.func import functional_call
 
 from benchmarks.studies.cut_demonstrations import Networks, unknown_task
 from benchmarks.studies.gwr_as_published import Arguments, grow
-from benchmarks.studies.trained import POLICIES
+from benchmarks.studies.trained import POLICIES, Row, summarized
 from bgpo_trl.modules.actor_critic import Actor, Critic, ProposalPolicy
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
@@ -71,3 +71,18 @@ def test_a_policy_of_proposals_is_taken_apart():
     only = {**weights, "only_clone": torch.tensor(True)}
     as_tested = functional_call(policy, POLICIES["as in tests"](only), (states.copy(),))["action"]
     assert as_tested.equal(found["clone alone"])
+
+
+def test_what_a_policy_has_above_its_clone_is_paired_by_seed():
+    """By hand: differences of .2 and .1, so .15 +- .64 with one degree of freedom."""
+    success = {"as in tests": (0.9, 0.5), "clone alone": (0.7, 0.4)}
+    rows = [
+        Row(policy, seed, "push", 10, of_seeds[seed], 12.0 + seed)
+        for policy, of_seeds in success.items()
+        for seed in (0, 1)
+    ]
+    cells = [line.strip("| ").split(" | ") for line in summarized(pd.DataFrame(rows)).splitlines()]
+    assert cells[0] == ["task", "as in tests", "clone alone", "above clone"]
+    assert cells[2] == ["push", "70.0 % in 12.5", "55.0 % in 12.5", "+15.0 [-49, +79]"]
+    alone = summarized(pd.DataFrame(rows[:2])).splitlines()
+    assert alone[0].strip("| ").split(" | ") == ["task", "as in tests"]

@@ -71,7 +71,7 @@ def test_made_encoders_and_bank_are_loaded(made, folder):
 def test_the_command_does_not_overwrite_shipped_weights_unasked(made, folder, monkeypatch):
     written = []
     monkeypatch.setattr(make_data, "train_encoders", lambda *given, **_: written.append(given[2]))
-    monkeypatch.setattr(make_data, "verdict_in", lambda of: f"verdict in {of}")
+    monkeypatch.setattr(make_data, "verdict_in", lambda of, _: f"verdict in {of}")
     asked = EncodersArguments(folder / "demonstrations", folder=folder / "own")
     assert make_data.encoders(asked) == f"verdict in {folder / 'own'}"
     make_data.encoders(replace(asked, weights=folder / "mine.safetensors"))

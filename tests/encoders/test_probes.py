@@ -1,5 +1,7 @@
 """Probes against known maps, and which frames they read."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +17,8 @@ from bgpo_trl.encoders.probes import (
     reconstruction_picture,
     ridge_predict,
     share_lost,
+    verdict,
+    verdict_in,
 )
 from bgpo_trl.encoders.representation import Representation, doubt_colors, encode_frames
 from bgpo_trl.encoders.train import make_bank
@@ -156,3 +160,26 @@ def test_things_that_are_lost_are_complained_of():
     assert complaints({**seen, "things_lost": 0.08}) == []
     (line,) = complaints({**seen, "things_lost": 0.47})
     assert line.startswith("47 % of the things that stand out in frames are not reconstructed")
+
+
+def test_the_verdict_judges_by_the_bounds_of_the_complaints(tmp_path):
+    good = {"moving_reconstruction": 0.5, "things_lost": 0.1, "task_accuracy_nearest": 0.9}
+    good |= {"inverse_r2": 0.5, "task_accuracy_chance": 0.5}
+    assert complaints(good) == []
+    assert [line.split()[-1] for line in verdict(good).splitlines()] == ["ok"] * 4
+    worse = {"moving_reconstruction": 0.49, "things_lost": 0.11, "task_accuracy_nearest": 0.89}
+    for key, value in {**worse, "inverse_r2": 0.49}.items():
+        wrong = {**good, key: value}
+        assert len(complaints(wrong)) == 1
+        (line,) = (line for line in verdict(wrong).splitlines() if line.endswith("not good"))
+        assert f" {value:.2f} " in line
+    (tmp_path / "probes.json").write_text(json.dumps({**good, "inverse_r2": 0.49}))
+    assert verdict_in(tmp_path, NICO) == verdict({**good, "inverse_r2": 0.49})
+    (tmp_path / "reconstructions.png").touch()
+    recorded = verdict_in(tmp_path, replace(NICO, bank_actions="recorded"))
+    assert recorded.endswith(f"\nlook for every object in {tmp_path / 'reconstructions.png'}")
+    assert "not good" not in recorded
+
+
+def test_an_untrained_vae_loses_all_things(untrained: Representation) -> None:
+    assert probe(untrained, demonstrations())["things_lost"] > 0.9

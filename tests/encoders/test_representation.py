@@ -328,6 +328,6 @@ def test_configurations_and_datasets_that_cannot_be_trained_on_are_refused() -> 
 
 def test_bfloat16_is_left_out_where_it_would_be_emulated(monkeypatch, tiny):
     monkeypatch.setattr(fitting, "has_bfloat16", lambda _: False)
-    with pytest.warns(UserWarning, match="emulates bfloat16"):
+    with pytest.warns(UserWarning, match="no instructions for bfloat16"):
         other = train(squares(8), replace(TINY, vae=replace(TINY.vae, bfloat16=True)))
     assert other.identity == tiny.identity

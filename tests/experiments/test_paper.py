@@ -250,6 +250,7 @@ def test_a_run_that_was_interrupted_while_it_made_encoders_is_resumed(
     undrawn, tmp_path, monkeypatch, encoders, bank
 ):
     monkeypatch.setattr(experiment, "make_pretrained", lambda *_, **__: (encoders, bank))
+    monkeypatch.setattr(experiment, "verdict_in", lambda *_: "")
     (tmp_path / "demonstrations").mkdir()
     arguments = Arguments(out=tmp_path, resume=True, episodes=2)
     with pytest.raises(ValueError, match="beginning of new encoders: add --train-encoders"):
@@ -264,14 +265,17 @@ def test_new_encoders_are_trained_with_the_settings_of_a_file(
 ):
     trained = []
 
-    def make(*_, config, **__):
+    def make(*_, config, folder, **__):
         trained.append(config)
+        (folder / "probes.json").write_text('{"things_lost": 0.25}')
         return encoders, bank
 
     monkeypatch.setattr(experiment, "make_pretrained", make)
     (path := tmp_path / "mine.yaml").write_text("vae: {steps: 7}\ninverse: {largest_action: 2}")
     arguments = Arguments(out=tmp_path / "run", episodes=2, train_encoders=True)
-    continual(replace(arguments, encoder_settings=path))
+    (tmp_path / "run" / "encoders").mkdir(parents=True)
+    text = continual(replace(arguments, encoder_settings=path))
+    assert re.search(r"its encoders:\nthings .* 0.25  at most 0.10   not good\n", text)
     usual = RepresentationConfig()
     vae, inverse = replace(usual.vae, steps=7), replace(usual.inverse, largest_action=2.0)
     assert trained == [replace(usual, vae=vae, inverse=inverse)]
