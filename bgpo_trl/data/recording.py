@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from operator import index
 from pathlib import Path
+from reprlib import repr as short_repr
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,7 @@ from bgpo_trl.data.dataset import (
 )
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.scenes import Scene, Simulation, find_scene
+from bgpo_trl.scenes.check import check_scene
 from bgpo_trl.scenes.scene import checked_frame, checked_numbers, checked_step
 
 _Policy = Callable[[], np.ndarray]
@@ -70,8 +73,8 @@ def record_demonstrations(
         (``False``: held out) and ``seed`` int64 ``[N]``; zero beyond the length.
 
     Raises:
-        ValueError: If an argument is invalid, ``path`` holds another recording, or the scene has no
-            demonstrator.
+        ValueError: If an argument is invalid, ``path`` holds another recording, the scene has no
+            demonstrator, or `check_scene` finds it wrong; there is a warning for what it doubts.
         OSError: If there is not enough disk space.
         RuntimeError: If there is no OpenGL to render with, or a demonstrator fails too often;
             earlier rows are kept.
@@ -119,6 +122,8 @@ def record_demonstrations(
         if meta.get("checksum"):
             return load_demonstrations(path)
     # The renderer comes first, so that a machine without OpenGL fails before writing anything.
+    for doubt in [] if started else check_scene(scene, tasks):
+        warnings.warn(f"the scene {scene.name!r}: {doubt}", stacklevel=2)
     observation = "pixels" if scene.state is None else "both"
     env = scene.simulate(tasks, batch_size=1, spread=spread, observation=observation)
     dataset = open_dataset(path, wanted) if started else make_dataset(path, wanted)
@@ -195,8 +200,8 @@ def perform(
         policy_of: Returns the policy that acts, given the demonstrator's.
 
     Raises:
-        ValueError: If an action is not finite, or the simulation returns what `Simulation` does not
-            allow.
+        ValueError: If an action has another size or is not finite, or the simulation returns what
+            `Simulation` does not allow.
     """
     simulation.seed(start)
     simulation.reset(task)
@@ -206,9 +211,11 @@ def perform(
     actions, success = [], False
     for _ in range(scene.max_steps):
         action = np.array(act())  # a copy, since a policy may use its array again
-        if not np.isfinite(action).all():  # what a simulation makes of it is its own
+        # What a simulation makes of others is its own.
+        if action.shape != (scene.action_size,) or not np.isfinite(action).all():
             raise ValueError(
-                f"an episode of the demonstrator of {task!r} has an action that is not finite"
+                f"an episode of the demonstrator of {task!r} has the action "
+                f"{short_repr(action.tolist())}: give {scene.action_size}, finite"
             )
         success, failure, executed = checked_step(simulation, action)
         actions.append(executed)

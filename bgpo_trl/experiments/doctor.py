@@ -22,13 +22,15 @@ def doctor(arguments: DoctorArguments) -> None:
     """Check this machine and installation, and print a line for each check."""
     checks: dict[str, Callable[[], str]] = {
         "versions": check_versions,
-        arguments.scene: lambda: check_scene(arguments),
+        arguments.scene: lambda: check_robot(arguments),
         "disk": check_disk,
     }
     wrong = False
     for subject, check in checks.items():
         try:
             level, message = "ok", check()
+        except UserWarning as doubt:
+            level, message = "look", str(doubt)
         except Exception as error:  # A broken package is reported, and the other checks go on.
             reason = next(iter(str(error).splitlines()), "")
             level, message, wrong = "wrong", f"{type(error).__name__}: {reason}", True
@@ -58,12 +60,17 @@ def check_versions() -> str:
     return ", ".join(found)
 
 
-def check_scene(arguments: DoctorArguments) -> str:
-    """Play random actions in ten simulations: frames must change; count frames a second."""
+def check_robot(arguments: DoctorArguments) -> str:
+    """Play random actions in ten simulations and count frames a second; then `check_scene`.
+
+    Raises:
+        UserWarning: What is doubtful.
+    """
     import torch
     from PIL import Image
 
     from bgpo_trl.scenes import find_scene
+    from bgpo_trl.scenes.check import check_scene
 
     scene = find_scene(arguments.scene)
     env = scene.simulate(scene.default_tasks, batch_size=[10], seed=0)
@@ -86,10 +93,12 @@ def check_scene(arguments: DoctorArguments) -> str:
             f"{seen}: try MUJOCO_GL=egl or osmesa; of an own scene, check camera and actions"
         )
     if rate < _SLOW:
-        return (
-            f"{seen}; this is slow: without a GPU, shadows and antialiasing cost most, of an own "
-            "scene switch them off (docs/extending.md, Your robot)"
+        seen += (
+            "; this is slow: without a GPU, shadows and antialiasing cost most, of an own scene "
+            "switch them off (docs/extending.md, Your robot)"
         )
+    if doubts := check_scene(scene):
+        raise UserWarning("; ".join([seen, *doubts]))
     return seen
 
 

@@ -1,0 +1,143 @@
+"""Whether a scene's simulations keep what runs rely on: `check_scene`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bgpo_trl.scenes.scene import Scene, Simulation, checked_frame, checked_step
+from bgpo_trl.scenes.simulation import RobotEnv
+
+_N_STARTS = 4
+_N_STEPS = 3
+# Renderers on a GPU repeat a picture to within a few levels of 255.
+_SAME = 8
+
+
+def check_scene(scene: Scene, tasks: Sequence[str] | None = None) -> list[str]:
+    """Play some moments of each task in two simulations; return what is doubtful, a line each.
+
+    A physical robot (`RobotEnv`) is not moved.
+
+    Doubtful is a start that is always the same, a frame that differs when it is asked for again, an
+    action that the frame after it does not show, and a component of actions that no frame shows.
+
+    Args:
+        scene: The robot, with a simulation.
+        tasks: Tasks to try, by default the scene's.
+
+    Raises:
+        ValueError: If a start does not follow from the seed, a task has always succeeded after a
+            step without movement, or the simulation returns what `Simulation` does not allow.
+    """
+    tasks = scene.default_tasks if tasks is None else tasks
+    env = scene.simulate(tasks, batch_size=1)
+    if isinstance(env, RobotEnv):
+        return []
+    other = scene.simulate(tasks, batch_size=1)
+    simulations = (env.simulations[0], other.simulations[0])
+    try:
+        doubts = [doubt for task in tasks for doubt in _Trial(scene, task).doubts(*simulations)]
+    finally:
+        env.close()
+        other.close()
+    return list(dict.fromkeys(doubts))
+
+
+class _Trial:
+    """One task, tried."""
+
+    def __init__(self, scene: Scene, task: str) -> None:
+        self.scene, self.task = scene, task
+
+    def doubts(self, simulation: Simulation, other: Simulation) -> list[str]:
+        """Return what is doubtful; raise ``ValueError`` for what is wrong."""
+        starts = [self.start(simulation, seed) for seed in range(_N_STARTS)]
+        simulation.seed(0)
+        other.seed(1)
+        for begun, start in ((simulation, starts[0]), (other, starts[1])):
+            if differ(self.reset(begun), start):
+                raise ValueError(
+                    f"two episodes of {self.task!r} with one seed begin differently: "
+                    f"{type(simulation).__name__}.seed() has to decide all that is drawn, and in "
+                    "its own simulation only"
+                )
+        again = [self.reset(simulation) for _ in starts]
+        doubts = list[str]()
+        for several, what in ((starts, "with whatever seed"), (again, "reset after reset")):
+            if not any(differ(frame, several[0]) for frame in several):
+                doubts.append(f"episodes begin with the same frame {what}: is a start drawn?")
+        if all(self.succeeds(simulation, seed) for seed in range(_N_STARTS)):
+            raise ValueError(
+                f"{self.task!r} has succeeded after one step without movement, from each of "
+                f"{_N_STARTS} starts: check reset() and success"
+            )
+        return doubts + self.unseen(simulation)
+
+    def unseen(self, simulation: Simulation) -> list[str]:
+        """Return what actions do not change in frames."""
+        size, doubts, prompt = self.scene.action_size, list[str](), False
+        for component in range(size):
+            push = self.scene.largest_action * np.eye(size)[component]
+            pairs = [
+                pair
+                for seed in range(_N_STARTS)
+                for pair in zip(
+                    self.play(simulation, seed, push),
+                    self.play(simulation, seed, -push),
+                    strict=False,
+                )
+            ]
+            if not any(differ(*pair) for pair in pairs):
+                doubts.append(
+                    f"component {component} of actions changes no frame within {_N_STEPS} steps: "
+                    "does it move something that the camera sees?"
+                )
+            prompt |= any(differ(*pair) for pair in pairs[::_N_STEPS])
+            self.start(simulation, 0)
+            checked_step(simulation, push)
+            if differ(self.frame(simulation), self.frame(simulation)):
+                return ["frame() differs when called twice: is it that of the step before?"]
+        if len(doubts) < size and not prompt:
+            doubts.append(
+                "the frame after the first step is the same whatever the action: is it the frame "
+                "of the step before?"
+            )
+        return doubts
+
+    def play(
+        self,
+        simulation: Simulation,
+        seed: int,
+        action: NDArray[np.float64],
+    ) -> list[NDArray[np.uint8]]:
+        """Return the frames after some steps with an action; an episode's last one stays."""
+        self.start(simulation, seed)
+        frames, over = list[NDArray[np.uint8]](), False
+        for _ in range(_N_STEPS):
+            if not over:
+                over = any(checked_step(simulation, action)[:2])
+            frames.append(self.frame(simulation))
+        return frames
+
+    def succeeds(self, simulation: Simulation, seed: int) -> bool:
+        self.start(simulation, seed)
+        return bool(checked_step(simulation, np.zeros(self.scene.action_size)).success)
+
+    def start(self, simulation: Simulation, seed: int) -> NDArray[np.uint8]:
+        simulation.seed(seed)
+        return self.reset(simulation)
+
+    def reset(self, simulation: Simulation) -> NDArray[np.uint8]:
+        simulation.reset(self.task)
+        return self.frame(simulation)
+
+    def frame(self, simulation: Simulation) -> NDArray[np.uint8]:
+        return checked_frame(simulation, self.scene.frame_shape)
+
+
+def differ(frame: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
+    """Return whether two frames show something else, beyond what a renderer repeats."""
+    return bool((np.abs(frame.astype(int) - other) > _SAME).any())
