@@ -28,7 +28,7 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.dataset import resize_frames
 from bgpo_trl.encoders.representation import (
     Representation,
-    doubt_colors,
+    doubt_frames,
     embed_demonstrations,
 )
 from bgpo_trl.files.writing import make_folder, write_whole
@@ -159,7 +159,7 @@ class TrainedPolicy:
 
         Args:
             demonstration: Frames, uint8 ``[T, H, W, 3]``, T at least 1; NICO's are 32 x 64. Warns
-                if there are more than an episode of the scene has, or if they seem blue first.
+                if there are more than an episode of the scene has, or if `doubt_frames` does.
             task: Task label, for algorithms that need it; ignored by others.
             generator: Source of MAML's draws for adaptation; None: derived from the seed.
 
@@ -178,7 +178,7 @@ class TrainedPolicy:
                 f"{scene.max_steps + 1}: give as many frames a second as the scene has steps",
                 stacklevel=3,  # of the call before no_grad's
             )
-        if doubt := doubt_colors(self.encoders.frame_network, frames):
+        if doubt := doubt_frames(self.encoders.frame_network, frames[:: len(frames) // 16 + 1]):
             warnings.warn(doubt, stacklevel=3)
         algorithm, index = self.algorithm, self._index
         if task is None and algorithm.needs_label:

@@ -14,7 +14,7 @@ from tensordict import TensorDict
 
 from bgpo_trl.encoders.fitting import train_representation
 from bgpo_trl.encoders.representation import (
-    doubt_colors,
+    doubt_frames,
     load_representation,
     save_representation,
 )
@@ -57,7 +57,7 @@ def test_tensors_of_two_devices_do_not_mix():
 def test_colors_are_doubted_wherever_the_network_is(device, encoders):
     frames = torch.randint(256, (3, 32, 64, 3), generator=torch.Generator().manual_seed(0))
     network, frames = deepcopy(encoders.frame_network), frames.to(torch.uint8)
-    assert doubt_colors(network.to(device), frames) == doubt_colors(encoders.frame_network, frames)
+    assert doubt_frames(network.to(device), frames) == doubt_frames(encoders.frame_network, frames)
 
 
 @pytest.mark.usefixtures("easy_world")

@@ -77,8 +77,7 @@ def test_updates_are_those_made_by_hand(first_save, offline_config, bank, encode
         by_hand.experts.play([of_seed[update * len(of_seed) // N] for of_seed in numbers])
         group = by_hand.active.group.unsqueeze(-1).expand(-1, -1, n_rows)
         batch = TensorDict(by_hand.shown.draw(group), group.shape)
-        noise = config.algorithm.demonstration_noise
-        imitated = by_hand.shown.draw_actions(group, noise)
+        imitated = by_hand.shown.draw_actions(group)
         for key, value in imitated.items():
             batch["imitation", key] = value
         by_hand.learner.learn(batch)

@@ -198,7 +198,7 @@ def test_a_demonstration_longer_than_an_episode_is_warned_of(load):
 def test_a_demonstration_that_seems_blue_first_is_warned_of(load, monkeypatch):
     policy = load()
     monkeypatch.setattr(
-        "bgpo_trl.policy.doubt_colors", lambda network, frames: "give them red first"
+        "bgpo_trl.policy.doubt_frames", lambda network, frames: "give them red first"
     )
     with pytest.warns(UserWarning, match="give them red first") as caught:
         policy.condition(DEMONSTRATIONS[1])

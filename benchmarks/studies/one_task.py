@@ -160,8 +160,7 @@ class Trial:
                 key: torch.cat([value, played[key].reshape(1, 1, -1, *value.shape[3:])], 2)
                 for key, value in batch.items()
             }
-        noise = BGPOConfig().demonstration_noise
-        imitated = self.shown.draw_actions(torch.zeros(1, 1, n_rows).long(), noise)
+        imitated = self.shown.draw_actions(torch.zeros(1, 1, n_rows).long())
         batch |= {("imitation", key): value for key, value in imitated.items()}
         return TensorDict(batch, [1, 1, n_rows])
 

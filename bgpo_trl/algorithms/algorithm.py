@@ -361,6 +361,7 @@ class Algorithm(ABC):
         return DemonstrationReplay(
             self.bank,
             generator=generators(self.seeds, "demonstration replay"),
+            noise=self.config.demonstration_noise,
             joints=self._demonstrated_joints(),
             constant_keys=constant_keys,
             own_constants=own_constants,
@@ -415,8 +416,7 @@ class Algorithm(ABC):
             played = self.replay.draw(groups(n_rows - n_shown), generator=generator)
             batch = {key: torch.cat([entry, shown[key]], 2) for key, entry in played.items()}
         if self.config.rl.imitates:
-            noise = self.config.demonstration_noise
-            imitated = self.shown.draw_actions(groups(n_rows), noise, generator=generator)
+            imitated = self.shown.draw_actions(groups(n_rows), generator=generator)
             batch |= {("imitation", key): entry for key, entry in imitated.items()}
         return TensorDict(batch, batch["priority_weight"].shape)
 

@@ -154,9 +154,10 @@ class AlgorithmConfig(Settings):
     demonstration_share: float = 0.0
     """Share of an update's transitions taken from the demonstrations shown so far in training, with
     actions inferred by the inverse model. Ours: the paper has none."""
-    demonstration_noise: float = 0.2
-    """Standard deviation of the noise added to the demonstrated states that a policy imitates.
-    Ours: keeps policies from learning a few demonstrations by heart (docs/learning.md)."""
+    demonstration_noise: float | None = None
+    """Standard deviation of the noise added to the demonstrated states that a policy imitates; None
+    for the one that was chosen when the bank was made (`choose_noise`). Ours: keeps policies from
+    learning a few demonstrations by heart (docs/learning.md)."""
 
     @property
     def observed(self) -> str:
@@ -184,7 +185,8 @@ class AlgorithmConfig(Settings):
         at_least(self, 1, "max_steps")
         if self.state_limit is not None:
             positive(self, "state_limit")
-        at_least(self, 0, "demonstration_noise")
+        if self.demonstration_noise is not None:
+            at_least(self, 0, "demonstration_noise")
         if share and self.rl.warmup_steps < self.max_steps:
             # Else, seeds would learn from demonstrations sooner or later than each would alone.
             raise ValueError(

@@ -139,6 +139,7 @@ class DemonstrationBank:
             ``None`` if unknown.
         spread: Share of the range of start states that the demonstrations were recorded over.
         scene: Identity of the scene that they show (`Scene.identity`), or ``None`` if unknown.
+        noise: Standard deviation of the noise that states to imitate should get (`choose_noise`).
 
     Raises:
         ValueError: If a label has no name, a name is given twice, or ``steps`` are of another
@@ -153,6 +154,7 @@ class DemonstrationBank:
     encoder_id: str | None = None
     spread: float = 1.0
     scene: str | None = None
+    noise: float = 0.2
 
     def __post_init__(self) -> None:
         for name in self.tasks:
@@ -230,7 +232,7 @@ class DemonstrationBank:
         return replace(kept, task=label[kept.task], tasks=tuple(tasks))
 
     def __add__(self, other: DemonstrationBank) -> DemonstrationBank:
-        """Concatenate two banks; task names found only in ``other`` are appended.
+        """Concatenate two banks, with the noise of the first; new task names are appended.
 
         Raises:
             ValueError: If they were embedded by different encoders, or show different scenes.
@@ -256,6 +258,7 @@ class DemonstrationBank:
             self.encoder_id,
             min(self.spread, other.spread),
             self.scene,
+            self.noise,
         )
 
     def _select(self, rows: Tensor) -> DemonstrationBank:
@@ -280,6 +283,7 @@ class DemonstrationBank:
             "encoder_id": self.encoder_id,
             "tasks": json.dumps(self.tasks),
             "spread": str(self.spread),
+            "noise": str(self.noise),
         }
         if self.scene is not None:
             meta["scene"] = self.scene
@@ -313,6 +317,7 @@ class DemonstrationBank:
                 encoder_id=encoder_id,
                 spread=float(meta["spread"]),
                 scene=meta.get("scene"),
+                noise=float(meta.get("noise", cls.noise)),
             )
         except FileNotFoundError:
             raise ValueError(f"there is no demonstration bank at {path}; {remedy}") from None

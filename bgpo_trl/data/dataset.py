@@ -224,6 +224,7 @@ def _empty(meta: Mapping[str, Any]) -> TensorDict:
 Episodes = Mapping[str, Sequence[Mapping[str, Any]]]
 """Episodes by the name of their task; for an episode's entries, see `write_demonstrations`."""
 _KEYS = ("pixels", "action", "state", "joints")
+_IDLE = 5  # steps; shorter ones may be part of a task
 _FAR = 20  # scales, by which degrees for radians are found
 
 
@@ -419,6 +420,15 @@ def _doubts(scene: Scene, episode: Mapping[str, Any], known: set[bytes]) -> Iter
     if content in known:
         yield "have the frames of an earlier one: give each once"
     known.add(content)
+    if len(pixels) > scene.max_steps + 1:
+        yield f"have more steps than the scene's {scene.max_steps}: at another rate, or not cut?"
+    repeated = (pixels[1:] == pixels[:-1]).all((1, 2, 3))
+    if repeated[1::2].all() != repeated[::2].all() and len(repeated) > _IDLE:
+        yield "repeat every other frame: is the camera slower than the actions?"
+    for end, frames in ("begin", pixels), ("end", pixels[::-1]):
+        still = int((frames == frames[0]).all((1, 2, 3)).cumprod().sum()) - 1
+        if _IDLE <= still < len(pixels) - 1:
+            yield f"{end} with {_IDLE} or more steps that change nothing: cut them off"
     if scene.joints is not None and "joints" in episode:
         apart = np.abs(np.asarray(episode["joints"]) - scene.joints.center)
         if (apart > _FAR * np.asarray(scene.joints.scale)).any():

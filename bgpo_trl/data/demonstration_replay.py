@@ -23,6 +23,7 @@ class DemonstrationReplay:
     Args:
         bank: Demonstrations that episodes are drawn from, with their steps.
         generator: Random generators for sampling, one for each of ``S`` seeds.
+        noise: Standard deviation of Gaussian noise on states to imitate, by default the bank's.
         joints: Joints in each frame of the bank's steps, as policies read them, float32
             ``[F, J]``, by which ``"latent_and_joints"`` stands in place of ``"latent"``; or None.
         constant_keys: Entries that are constant within an episode, stored with each demonstration.
@@ -41,6 +42,7 @@ class DemonstrationReplay:
         bank: DemonstrationBank,
         *,
         generator: Sequence[torch.Generator],
+        noise: float | None = None,
         joints: Tensor | None = None,
         constant_keys: Sequence[NestedKey] = (),
         own_constants: bool = True,
@@ -63,6 +65,7 @@ class DemonstrationReplay:
         self._steps, self._joints = bank.steps, joints
         self._key = "latent" if joints is None else "latent_and_joints"
         self._generators = list(generator)
+        self.noise = bank.noise if noise is None else noise
         self._n_steps, self._gamma = n_steps, gamma
         self._own_constants = own_constants
         self._constant_keys = list(constant_keys)
@@ -121,17 +124,12 @@ class DemonstrationReplay:
         }
 
     def draw_actions(
-        self,
-        group: Tensor,
-        noise: float,
-        *,
-        generator: Sequence[torch.Generator] | None = None,
+        self, group: Tensor, *, generator: Sequence[torch.Generator] | None = None
     ) -> dict[NestedKey, Tensor]:
-        """Draw latents and actions to imitate, as `draw` does.
+        """Draw latents, with noise, and actions to imitate, as `draw` does.
 
         Args:
             group: Group of each row, int64 ``[S, *R]``.
-            noise: Standard deviation of Gaussian noise added to the latents.
             generator: Random generators of the seeds, in place of the replay's.
 
         Returns:
@@ -141,7 +139,7 @@ class DemonstrationReplay:
         entries, _, frame, _ = self._draw_frames(group, sources)
         state = self._states(frame)
         drawn = draw_for_rows(torch.randn, group, sources, state.shape[-1])
-        return {**entries, self._key: state + noise * drawn}
+        return {**entries, self._key: state + self.noise * drawn}
 
     def _states(self, frame: Tensor) -> Tensor:
         """Return what policies read of frames int64 ``[...]``, float32 ``[..., features]``."""

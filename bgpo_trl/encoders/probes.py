@@ -22,7 +22,7 @@ from torch import Tensor
 
 from bgpo_trl.encoders.representation import (
     Representation,
-    doubt_colors,
+    doubt_frames,
     encode_frames,
     mean_frame,
     split,
@@ -40,7 +40,7 @@ from bgpo_trl.scenes import Scene, StateColumns
 _SEARCHED = 300  # frames in which things are looked for
 _STANDS_OUT, _THING = 0.15, 4  # deviation of a pixel in the range of colors; least pixels
 _ALIKE = 0.5  # correlation of actions from which a comparison means something
-_COMPARED = 256  # frames whose colors are compared, about
+_COMPARED = 256  # frames that are compared, about
 
 
 def probe(
@@ -244,13 +244,12 @@ def verdict_in(folder: Path, scene: Scene) -> str:
 
 
 @torch.no_grad()
-def mismatches(
-    network: FrameNetwork, dataset: TensorDictBase, inferred: Tensor | None
-) -> list[str]:
-    """Return in what demonstrations seem unlike those that encoders were trained on, a line each.
+def mismatch(network: FrameNetwork, dataset: TensorDictBase, inferred: Tensor | None) -> str:
+    """Return in what demonstrations seem unlike those that encoders were trained on, or "".
 
-    Recorded actions are compared with inferred ones, also with those of the step before and after,
-    and frames with the same frames whose red and blue are exchanged.
+    Recorded actions are compared with inferred ones, and frames with their reconstructions, each
+    also after what people get wrong: a step earlier or later, components exchanged, a mirrored
+    camera and the like. What leaves no trace in frames is not seen: tasks exchanged, or ends cut.
 
     Args:
         network: The frame encoder.
@@ -261,10 +260,11 @@ def mismatches(
     every = max(1, int(length.sum()) // _COMPARED)
     shown = {key: dataset[key][::every] for key in ("pixels", "length")}
     some = TensorDict(shown, [len(shown["length"])])
-    doubts = [doubt_colors(network, valid_frames(some)[:_COMPARED])]
-    if inferred is not None and recorded is not None:
-        doubts.append(_doubt_actions(recorded, inferred, length))
-    return [doubt for doubt in doubts if doubt]
+    doubt = doubt_frames(network, valid_frames(some)[:_COMPARED])
+    # From frames that are wrong, wrong actions are inferred.
+    if not doubt and inferred is not None and recorded is not None:
+        doubt = _doubt_actions(recorded, inferred, length)
+    return doubt
 
 
 def _doubt_actions(recorded: Tensor, inferred: Tensor, length: Tensor) -> str:
@@ -278,18 +278,45 @@ def _doubt_actions(recorded: Tensor, inferred: Tensor, length: Tensor) -> str:
     now = correlation(recorded[moves], inferred[moves])
     late = correlation(recorded[:, 1:][later], inferred[:, :-1][later])
     early = correlation(recorded[:, :-1][later], inferred[:, 1:][later])
-    if max(late, early) > max(now, _ALIKE):
+    if max(late, early) > max(now + 0.1, _ALIKE):
         when = "late" if late > early else "early"
         return (
             f"recorded actions seem to be a step too {when} (correlation with what frames show: "
             f"{now:.2f}, shifted {max(late, early):.2f}): action t leads from frame t to t + 1"
         )
-    own = inferred[moves]
-    scale = float((recorded[moves] * own).sum() / own.square().sum().clamp_min(1e-9))
-    if now > _ALIKE and not 0.5 < scale < 2:
+    given, own = recorded[moves], inferred[moves]
+    alike = torch.tensor(
+        [[correlation(one, other) for other in own.unbind(-1)] for one in given.unbind(-1)]
+    )
+    strongest = alike.abs().argmax(1).tolist()
+    for component, other in enumerate(strongest):
+        found = float(alike[component, other])
+        if component != other and abs(found) > max(_ALIKE, 2 * abs(alike[component, component])):
+            return (
+                f"component {component} of recorded actions moves what component {other} moved in "
+                f"the encoders' demonstrations (correlation {found:.2f}): exchange them"
+            )
+        if component == other and found < -_ALIKE:
+            return (
+                f"component {component} of recorded actions has the opposite sign of what frames "
+                f"show (correlation {found:.2f}): turn it round"
+            )
+    if now < _ALIKE:
+        return (
+            f"recorded actions have little to do with what frames show (correlation {now:.2f}): "
+            "give what the robot was told at each step, as in the encoders' demonstrations"
+        )
+    for component, offset in enumerate((given - own).mean(0).tolist()):
+        if abs(offset) > _ALIKE * own[:, component].std():
+            return (
+                f"component {component} of recorded actions is {offset:+.2f} off what frames "
+                "show, on average: scale it as in the encoders' demonstrations"
+            )
+    scale = float((given * own).sum() / own.square().sum().clamp_min(1e-9))
+    if not 0.75 < scale < 1.33:
         return (
             f"recorded actions are {scale:.2f} times as large as frames suggest: scale them as "
-            "those of the encoders' demonstrations"
+            "those of the encoders' demonstrations, and give as many frames a second"
         )
     return ""
 

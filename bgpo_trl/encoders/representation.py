@@ -105,25 +105,66 @@ def encode_frames(network: FrameNetwork, dataset: TensorDictBase) -> Tensor:
     return latent
 
 
-@torch.no_grad()
-def doubt_colors(network: FrameNetwork, frames: Tensor) -> str:
-    """Return what to do if frames uint8 ``[N, H, W, 3]`` seem to have blue first, else "".
+def _moved(rows: int, columns: int) -> Callable[[Tensor], Tensor]:
+    """Return what moves frames down and to the right, and repeats the edge."""
 
-    A VAE then reconstructs them better with red and blue exchanged; other networks cannot tell.
+    def move(frames: Tensor) -> Tensor:
+        for dim, by in ((1, rows), (2, columns)):
+            places = torch.arange(frames.shape[dim], device=frames.device) - by
+            frames = frames.index_select(dim, places.clamp(0, frames.shape[dim] - 1))
+        return frames
+
+    return move
+
+
+def _brighter(factor: float) -> Callable[[Tensor], Tensor]:
+    return lambda frames: (factor * frames).clamp(0, 255).to(torch.uint8)
+
+
+_RED = "give them red first (OpenCV's are blue first, frame[..., ::-1] turns them)"
+_CAMERA = "place and set the camera as for the encoders' demonstrations, or train encoders anew"
+# What may be wrong with frames: what they fit better with, how to get there, and what to do.
+_CHANGES: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
+    "with red and blue exchanged": (lambda frames: frames.flip(-1), _RED),
+    "mirrored": (lambda frames: frames.flip(2), _CAMERA),
+    "upside down": (lambda frames: frames.flip(1), _CAMERA),
+    "turned by 180 degrees": (lambda frames: frames.flip(1, 2), _CAMERA),
+    "with rows and columns exchanged": (lambda frames: frames.transpose(1, 2), _CAMERA),
+    "a quarter brighter": (_brighter(1.25), _CAMERA),
+    "a fifth darker": (_brighter(0.8), _CAMERA),
+    **{
+        f"{by} pixel{'s' * (by > 1)} farther {where}": (_moved(by * rows, by * columns), _CAMERA)
+        for by in (1, 3)
+        for where, rows, columns in (
+            ("up", -1, 0),
+            ("down", 1, 0),
+            ("left", 0, -1),
+            ("right", 0, 1),
+        )
+    },
+}
+
+
+@torch.no_grad()
+def doubt_frames(network: FrameNetwork, frames: Tensor) -> str:
+    """Return what to do if frames uint8 ``[N, H, W, 3]`` seem taken otherwise than in training.
+
+    A VAE then reconstructs them better once they are changed: colors exchanged, mirrored, turned,
+    brighter, darker, or moved. Without a decoder, other networks cannot tell: the result is "".
     """
     if not isinstance(network, VAE):
         return ""
     frames = frames.to(network.latent_mean.device)
-    given, exchanged = (
-        (some / 255 - network.decode(network.encode(some)[0])).square().mean()
-        for some in (frames, frames.flip(-1))
-    )
-    if exchanged >= 0.9 * given:  # in doubt, as it is
+
+    def error(some: Tensor) -> float:
+        return float((some / 255 - network.decode(network.encode(some)[0])).square().mean())
+
+    changed = {how: change(frames) for how, (change, _) in _CHANGES.items()}
+    errors = {how: error(some) for how, some in changed.items() if some.shape == frames.shape}
+    best = min(errors, key=errors.__getitem__)
+    if errors[best] >= 0.9 * error(frames):  # in doubt, as they are
         return ""
-    return (
-        "frames fit the encoders better with red and blue exchanged: give them red first "
-        "(OpenCV's are blue first, frame[..., ::-1] turns them)"
-    )
+    return f"frames fit the encoders better {best}: {_CHANGES[best][1]}"
 
 
 @torch.no_grad()

@@ -16,8 +16,9 @@ from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.fitting import Log, retrain_inverse, train_representation
+from bgpo_trl.encoders.imitation import choose_noise
 from bgpo_trl.encoders.pretrained import bank_path
-from bgpo_trl.encoders.probes import complaints, judged, mismatches, probe
+from bgpo_trl.encoders.probes import complaints, judged, mismatch, probe
 from bgpo_trl.encoders.representation import (
     Representation,
     encode_frames,
@@ -92,7 +93,8 @@ def train_encoders(
             representation = train_representation(dataset, config, play=play, **how)
     save_representation(representation, weights)
     actions = scene.bank_actions
-    bank = make_bank(representation, dataset, tasks=tasks, actions=actions, spread=spread)
+    made = {"tasks": tasks, "actions": actions, "spread": spread}
+    bank = make_bank(representation, dataset, **made, compare=False)
     bank.save(bank_path(weights))
     play = None if keep else play
     found = probe(representation, dataset, folder, play=play, columns=scene.state)
@@ -109,10 +111,11 @@ def make_bank(
     tasks: Sequence[str],
     actions: Literal["inferred", "recorded"] = "recorded",
     spread: float = 1.0,
+    compare: bool = True,
 ) -> DemonstrationBank:
     """Embed demonstrations; keep latents, actions and joints of the training ones.
 
-    Warns of what `mismatches` finds.
+    The noise for imitation is chosen by `choose_noise`, within some seconds for each task.
 
     Args:
         representation: The trained encoders.
@@ -124,18 +127,19 @@ def make_bank(
             actions that an observer of a demonstration has. Without either, the bank has no steps:
             embeddings alone, without demonstrations as experience.
         spread: Share of the range of start states that the dataset was recorded over.
+        compare: Whether to warn of what `mismatch` finds, as for other data than the encoders' own.
     """
     length = dataset["length"]
     latent = encode_frames(representation.frame_network, dataset)
     inverse = representation.inverse
     inferred = None if inverse is None else inverse(latent, length)
-    for mismatch in mismatches(representation.frame_network, dataset, inferred):
-        warnings.warn(mismatch, stacklevel=3)  # of the call before no_grad's
+    if compare and (doubt := mismatch(representation.frame_network, dataset, inferred)):
+        warnings.warn(doubt, stacklevel=3)  # of the call before no_grad's
     action = dataset.get("action", None)
     if actions == "inferred" or action is None:
         action = inferred
     train, joints = dataset["train"].clone(), dataset.get("joints", None)
-    return DemonstrationBank(
+    bank = DemonstrationBank(
         representation.lae.encode(latent, length),
         dataset["task"].clone(),
         train,
@@ -145,6 +149,8 @@ def make_bank(
         spread,
         representation.metadata.get("scene"),
     )
+    noise = choose_noise(bank)
+    return bank if noise is None else replace(bank, noise=noise)
 
 
 def make_pretrained(

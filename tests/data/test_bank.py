@@ -259,11 +259,11 @@ def test_the_command_keeps_the_names_of_the_tasks(tmp_path, encoders, monkeypatc
 def test_a_bank_remembers_encoders_and_scene_and_joins_none_of_others(with_steps, tmp_path):
     path, unknown = tmp_path / "bank.safetensors", replace(with_steps, encoder_id=None)
     assert with_steps.scene is None
-    one = replace(with_steps, scene="nico 1")
+    one = replace(with_steps, scene="nico 1", noise=0.05)
     one.save(path)
     loaded = DemonstrationBank.load(path, encoder_id="x")
     for part in (loaded, loaded.seen(), loaded.for_tasks(loaded.tasks[1:]), loaded + one):
-        assert (part.encoder_id, part.scene) == ("x", "nico 1")
+        assert (part.encoder_id, part.scene, part.noise) == ("x", "nico 1", 0.05)
     assert loaded.identity == one.identity
     with pytest.raises(ValueError, match="set encoder_id"):
         unknown.save(path)

@@ -105,12 +105,12 @@ def test_transitions_are_the_steps_of_what_was_shown_in_the_rows_group(make_show
 
 def test_what_is_to_be_imitated_are_the_same_draws_with_noise_on_the_states_alone(make_shown):
     """A seed's own noise, however many slots are free."""
-    plain, quiet, noisy, wide = (make_shown(n_steps=3) for _ in range(4))
+    plain, quiet, noisy, wide = (make_shown(n_steps=3, noise=x) for x in (0.3, 0.0, 0.4, 0.4))
     group = torch.zeros(2, 4_000, dtype=torch.int64)
     sampled, still, drawn = (
         plain.draw(group),
-        quiet.draw_actions(group, 0.0),
-        noisy.draw_actions(group, 0.4),
+        quiet.draw_actions(group),
+        noisy.draw_actions(group),
     )
     assert {*drawn} == {"latent", "action", "priority_weight", *CONSTANT}
     for key, value in still.items():
@@ -120,7 +120,7 @@ def test_what_is_to_be_imitated_are_the_same_draws_with_noise_on_the_states_alon
     assert float(noise.mean()) == pytest.approx(0.0, abs=0.01)
     assert float(noise.std()) == pytest.approx(0.4, abs=0.01)
     free = torch.full([2, 4_000], -1)
-    spread = wide.draw_actions(torch.stack([group, free], -1).view(2, -1), 0.4)
+    spread = wide.draw_actions(torch.stack([group, free], -1).view(2, -1))
     assert spread["latent"][:, ::2].equal(drawn["latent"])
     assert not spread["priority_weight"][:, 1::2].any()
 

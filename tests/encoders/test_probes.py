@@ -1,6 +1,7 @@
 """Probes against known maps, and which frames they read."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.probes import (
     complaints,
-    mismatches,
+    mismatch,
     probe,
     reconstruction_picture,
     ridge_predict,
@@ -20,7 +21,7 @@ from bgpo_trl.encoders.probes import (
     verdict,
     verdict_in,
 )
-from bgpo_trl.encoders.representation import Representation, doubt_colors, encode_frames
+from bgpo_trl.encoders.representation import Representation, doubt_frames, encode_frames
 from bgpo_trl.encoders.train import make_bank
 from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
@@ -67,20 +68,34 @@ def test_demonstrations_unlike_those_of_the_encoders_are_told(tmp_path: Path) ->
     encoders = load_pretrained()[0]
     latent, action = encode_frames(encoders.frame_network, dataset), dataset["action"]
     inferred = encoders.inverse(latent, dataset["length"])
-    none = torch.zeros_like(action[:, :1])
+    none, network = torch.zeros_like(action[:, :1]), encoders.frame_network
     for changed, said in (
         (action, None),
         (torch.cat([none, action[:, :-1]], 1), "a step too late"),
         (torch.cat([action[:, 1:], none], 1), "a step too early"),
         (0.2 * action, "0.20 times as large as frames suggest"),
-        (torch.rand_like(action), None),  # which nothing can be told of
+        (action * torch.tensor([1.0, -1.0, 1.0, 1.0]), "component 1 .* opposite sign"),
+        (action[..., [1, 0, 2, 3]], "component 0 of recorded actions moves what component 1 moved"),
+        (action + torch.tensor([0.0, 0.0, 0.3, 0.0]), r"component 2 .* is \+0.\d+ off"),
+        (torch.rand_like(action) - 0.5, "little to do with what frames show"),
     ):
-        changed = dataset.clone().update({"action": changed})
-        found = mismatches(encoders.frame_network, changed, inferred)
-        assert [said in line for line in found] == ([] if said is None else [True])
+        found = mismatch(network, dataset.clone().update({"action": changed}), inferred)
+        assert re.search(said, found) if said else not found, found
     shown = dataset["pixels"][0, : dataset["length"][0]]
-    assert not doubt_colors(encoders.frame_network, shown)
-    assert "red and blue exchanged" in doubt_colors(encoders.frame_network, shown.flip(-1))
+    wide = shown.float()
+    for frames, said in (
+        (shown, None),
+        (shown.flip(-1), "red and blue exchanged: give them red first"),
+        (shown.flip(2), "mirrored: place"),
+        (shown.flip(1), "upside down"),
+        (shown.flip(1, 2), "turned by 180 degrees"),
+        (0.75 * wide, "a quarter brighter"),
+        ((1.3 * wide).clamp(0, 255), "a fifth darker"),
+        (shown.roll(1, 1), "1 pixel farther up"),
+        (shown.roll(-3, 2), "3 pixels farther right"),
+    ):
+        found = doubt_frames(network, frames.to(torch.uint8))
+        assert said in found if said else not found, found
     blue = dataset.clone().update({"pixels": dataset["pixels"].flip(-1)}).exclude("action")
     with pytest.warns(UserWarning, match="better with red and blue exchanged"):
         make_bank(encoders, blue, tasks=NICO.default_tasks)

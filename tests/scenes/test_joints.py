@@ -122,7 +122,7 @@ def test_replays_hold_joints_as_policies_read_them(made, dot, tmp_path):
     played = algorithm.replay.contents(0)[0]
     groups = torch.zeros(2, 32, dtype=torch.int64)
     shown = algorithm.shown.draw(groups)
-    imitated = algorithm.shown.draw_actions(groups, 0.0)
+    imitated = algorithm.shown.draw_actions(groups)
     assert algorithm.in_keys == ["latent_and_joints", "context"]
     recorded = scaled(made[2].steps.joints)
     for key in ("latent_and_joints", ("next", "latent_and_joints")):
