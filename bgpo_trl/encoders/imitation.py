@@ -11,7 +11,7 @@ from bgpo_trl.modules.stacked_mlp import StackedLinear
 _NOISES = (0.0, 0.02, 0.05, 0.1, 0.2)
 _FEWEST, _MOST = 8, 125  # demonstrations of a task, of which a fifth judges
 _N_UPDATES, _N_ROWS = 500, 128
-_AS_GOOD = 1.03
+_AS_GOOD = 1.01
 
 
 def choose_noise(bank: DemonstrationBank) -> float | None:
@@ -19,7 +19,7 @@ def choose_noise(bank: DemonstrationBank) -> float | None:
 
     Noise keeps a clone from learning a few demonstrations by heart, and blurs what it sees: how
     much is good depends on how finely latents tell places apart. For each task and noise, a clone
-    learns from four fifths of up to 125 training demonstrations. Of noises that are within 3 % of
+    learns from four fifths of up to 125 training demonstrations. Of noises that are within 1 % of
     the best, in the mean over tasks of the squared error of actions, the largest is chosen.
 
     Args:
