@@ -22,12 +22,13 @@ from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import plot_step_curves, plot_success_curves
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.runs.provenance import command, write_table
-from bgpo_trl.runs.results import COLUMNS, read_run
+from bgpo_trl.runs.results import COLUMNS, Run, read_run
 from bgpo_trl.scenes import find_scene
 from bgpo_trl.training import Trainer
 
 # Number of the evaluation after training; it seeds start states that training never tested.
 _LAST = 2**31
+_SELDOM = 0.5
 
 
 def measure(
@@ -113,13 +114,14 @@ def _final_tests(trainer: Trainer, bank: DemonstrationBank, *, episodes: int) ->
 def draw(
     trainer: Trainer, bank: DemonstrationBank, out: Path, summary: Mapping[str, Any]
 ) -> list[str]:
-    """Draw the figures of the run, and describe its GWR-B.
+    """Draw the figures of the run, and describe it.
 
     Returns:
-        Lines about GWR-B, its task inference and its groups.
+        Lines about the success in each task, and about GWR-B, its task inference and its groups.
     """
-    config, lines = trainer.config, list[str]()
+    config = trainer.config
     run = replace(read_run(out), summary=dict(summary))
+    lines = success_lines(run)
     save_figure(plot_success_curves({config.name: run}), out / "figures" / "success.png")
     if (run.tests["success"] == 1).any():
         save_figure(plot_step_curves({config.name: run}), out / "figures" / "steps.png")
@@ -139,6 +141,23 @@ def draw(
             f"groups of behaviors: {summary['groups']}, {purity:.1%} of held-out demonstrations in "
             "a group of their task"
         )
+    return lines
+
+
+def success_lines(run: Run) -> list[str]:
+    """Return a line for each task about the final tests, and what to do if one seldom succeeds."""
+    success, steps = (final_means(run, "seen", column) for column in ("success", "steps"))
+    if success is None:
+        return []
+    shown, lines = run.summary["demonstrated_steps"], list[str]()
+    for index, task in enumerate(run.tasks):
+        line = f"{task}: {success[:, index].mean():.0%} of tests succeed"
+        if steps is not None and not np.isnan(steps[:, index]).all():
+            line += f", in {np.nanmean(steps[:, index]):.1f} steps"
+            line += f" (demonstrated in {shown[task]:.1f})" if task in shown else ""
+        lines.append(line)
+    if success.mean(0).min() < _SELDOM:
+        lines.append("a task seldom succeeds: docs/extending.md says where to look, one by one")
     return lines
 
 

@@ -20,14 +20,16 @@ from bgpo_trl.analysis.comparison import NAMES
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.experiments.arguments import Arguments
+from bgpo_trl.experiments.measure import success_lines
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.experiments.run import concurrent, continual
 from bgpo_trl.files.checkpoint import load_checkpoint
-from bgpo_trl.runs.results import read_table
+from bgpo_trl.runs.results import read_run, read_table
 from suites import nico
 from tests.helpers import Recorder, cells, contents, rows
 
 ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "benchmarks" / "results"
 TASKS = nico.PAPER_TASKS
 FIGURES = ("success.png", "gwr.png", "groups.png", "episodes.png")
 WITH_GROUPS = ("bgpo", "clone", "bgpo-experts", "group-balanced-replay")
@@ -42,6 +44,11 @@ def json_of(run, name):
 def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path):
     run = tmp_path / "a run"
     printed = concurrent(Arguments(out=run))
+    for task, of_task in (
+        read_table(run / "final.csv").query("demonstrations == 'seen'").groupby("task")
+    ):
+        assert f"{task}: {of_task['success'].mean():.0%} of tests succeed" in printed
+    assert "docs/extending.md says where to look" in printed  # after six episodes
     assert "GWR-B nodes: [" in printed and "groups of behaviors: [" in printed
     assert shlex.split(printed)[-3:] == ["bgpo", "report", str(run)]
     figures = {path.name for path in (run / "figures").iterdir()}
@@ -307,3 +314,18 @@ def test_a_task_is_added_to_a_finished_run_and_reported(undrawn, tmp_path, encod
         continual(replace(command, resume=False))
     with pytest.raises(ValueError, match="is for `bgpo continual`"):
         concurrent(command)
+
+
+def test_a_run_says_what_it_reached_and_in_how_many_steps():
+    """Of an archived run: equal to its rows, whose tests are as many for each seed."""
+    run = read_run(RESULTS / "desk-learner" / "continual-bgpo")
+    *lines, last = success_lines(run)
+    tests = run.final[run.final["demonstrations"] == "seen"]
+    for line, task in zip([*lines, last], run.tasks, strict=True):
+        rate, steps, shown = map(float, re.findall(r"([\d.]+)(?:%| steps|\))", line))
+        found = tests[tests["task"] == task].groupby("seed")[["success", "steps"]].mean().mean()
+        assert line.startswith(f"{task}: ")
+        assert (rate, steps) == (round(100 * found["success"]), round(found["steps"], 1))
+        assert shown == round(run.summary["demonstrated_steps"][task], 1)
+    poor = run.final.assign(success=run.final["success"] * (run.final["task"] != run.tasks[1]))
+    assert "seldom succeeds" in success_lines(replace(run, final=poor))[-1]
