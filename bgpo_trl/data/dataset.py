@@ -423,7 +423,7 @@ def _doubts(scene: Scene, episode: Mapping[str, Any], known: set[bytes]) -> Iter
     if len(pixels) > scene.max_steps + 1:
         yield f"have more steps than the scene's {scene.max_steps}: at another rate, or not cut?"
     repeated = (pixels[1:] == pixels[:-1]).all((1, 2, 3))
-    if repeated[1::2].all() != repeated[::2].all() and len(repeated) > _IDLE:
+    if len(repeated) > _IDLE and (repeated[1:] != repeated[:-1]).all():
         yield "repeat every other frame: is the camera slower than the actions?"
     for end, frames in ("begin", pixels), ("end", pixels[::-1]):
         still = int((frames == frames[0]).all((1, 2, 3)).cumprod().sum()) - 1

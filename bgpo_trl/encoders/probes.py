@@ -40,6 +40,7 @@ from bgpo_trl.scenes import Scene, StateColumns
 _SEARCHED = 300  # frames in which things are looked for
 _STANDS_OUT, _THING = 0.15, 4  # deviation of a pixel in the range of colors; least pixels
 _ALIKE = 0.5  # correlation of actions from which a comparison means something
+_OWN_TASK = 0.9  # share of demonstrations that are nearest to one of their own task
 _COMPARED = 256  # frames that are compared, about
 
 
@@ -171,7 +172,7 @@ _CHECKS = (
     _Check(
         "task_accuracy_nearest",
         "nearest demonstration is of the same task",
-        0.9,
+        _OWN_TASK,
         "{task_accuracy_nearest:.0%} of the held-out demonstrations are nearest to one of their "
         "own task, {task_accuracy_chance:.0%} by chance: groups of behaviors will mix tasks; show "
         "objects larger, train longer (vae.steps, lae.steps), or record more demonstrations, or "
@@ -244,17 +245,21 @@ def verdict_in(folder: Path, scene: Scene) -> str:
 
 
 @torch.no_grad()
-def mismatch(network: FrameNetwork, dataset: TensorDictBase, inferred: Tensor | None) -> str:
+def mismatch(
+    network: FrameNetwork, dataset: TensorDictBase, inferred: Tensor | None, embedding: Tensor
+) -> str:
     """Return in what demonstrations seem unlike those that encoders were trained on, or "".
 
     Recorded actions are compared with inferred ones, and frames with their reconstructions, each
     also after what people get wrong: a step earlier or later, components exchanged, a mirrored
-    camera and the like. What leaves no trace in frames is not seen: tasks exchanged, or ends cut.
+    camera and the like. Demonstrations should be nearest to one of their own task. What leaves no
+    trace is not seen: tasks exchanged as a whole, or ends cut off.
 
     Args:
         network: The frame encoder.
-        dataset: Reads ``pixels``, ``length`` and, if it is there, ``action``.
+        dataset: Reads ``pixels``, ``length``, ``task`` and, if it is there, ``action``.
         inferred: Actions of the inverse model for its frames ``[N, T - 1, A]``, or None.
+        embedding: Embeddings of the demonstrations, ``[N, 32]``.
     """
     length, recorded = dataset["length"], dataset.get("action", None)
     every = max(1, int(length.sum()) // _COMPARED)
@@ -264,7 +269,22 @@ def mismatch(network: FrameNetwork, dataset: TensorDictBase, inferred: Tensor | 
     # From frames that are wrong, wrong actions are inferred.
     if not doubt and inferred is not None and recorded is not None:
         doubt = _doubt_actions(recorded, inferred, length)
-    return doubt
+    return doubt or _doubt_tasks(embedding, dataset["task"])
+
+
+def _doubt_tasks(embedding: Tensor, task: Tensor) -> str:
+    """Return that tasks ``[N]`` of nearest embeddings ``[N, 32]`` differ too often, or ""."""
+    some = torch.arange(len(task))[:: len(task) // 2_000 + 1]
+    embedding, task = embedding[some], task[some]
+    nearest = torch.cdist(embedding, embedding).fill_diagonal_(torch.inf).argmin(1)
+    own = float((task[nearest] == task).float().mean())
+    # Of few, none of the same task need be near.
+    if own >= _OWN_TASK or len(task) < 8 * len(task.unique()):
+        return ""
+    return (
+        f"{own:.0%} of the demonstrations are nearest to one of their own task: are tasks mixed "
+        "up, or do the encoders not tell them apart?"
+    )
 
 
 def _doubt_actions(recorded: Tensor, inferred: Tensor, length: Tensor) -> str:

@@ -133,14 +133,15 @@ def make_bank(
     latent = encode_frames(representation.frame_network, dataset)
     inverse = representation.inverse
     inferred = None if inverse is None else inverse(latent, length)
-    if compare and (doubt := mismatch(representation.frame_network, dataset, inferred)):
+    embedding = representation.lae.encode(latent, length)
+    if compare and (doubt := mismatch(representation.frame_network, dataset, inferred, embedding)):
         warnings.warn(doubt, stacklevel=3)  # of the call before no_grad's
     action = dataset.get("action", None)
     if actions == "inferred" or action is None:
         action = inferred
     train, joints = dataset["train"].clone(), dataset.get("joints", None)
     bank = DemonstrationBank(
-        representation.lae.encode(latent, length),
+        embedding,
         dataset["task"].clone(),
         train,
         tuple(tasks),

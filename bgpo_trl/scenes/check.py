@@ -19,10 +19,9 @@ _SAME = 8
 def check_scene(scene: Scene, tasks: Sequence[str] | None = None) -> list[str]:
     """Play some moments of each task in two simulations; return what is doubtful, a line each.
 
-    A physical robot (`RobotEnv`) is not moved.
-
     Doubtful is a start that is always the same, a frame that differs when it is asked for again, an
     action that the frame after it does not show, and a component of actions that no frame shows.
+    A physical robot (`RobotEnv`) is not moved, and nothing is said of it.
 
     Args:
         scene: The robot, with a simulation.
@@ -87,7 +86,7 @@ class _Trial:
                 for pair in zip(
                     self.play(simulation, seed, push),
                     self.play(simulation, seed, -push),
-                    strict=False,
+                    strict=True,
                 )
             ]
             if not any(differ(*pair) for pair in pairs):

@@ -1,6 +1,7 @@
 """Datasets of demonstrations: damaged ones, and those that are written from elsewhere."""
 
 import shutil
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -128,6 +129,28 @@ def test_episodes_without_movement_and_such_as_are_given_twice_are_named(tmp_pat
         f"3 of 5 episodes, such as 2 of '{TASKS[0]}', have the frames of an earlier one: give "
         "each once",
     ]
+
+
+@pytest.mark.parametrize(
+    ("length", "order", "doubt"),
+    [
+        (52, range(52), "have more steps than the scene's 50: at another rate, or not cut?"),
+        (9, [0] * 6 + [1, 2, 3], "begin with 5 or more steps that change nothing: cut them off"),
+        (9, [0, 1, 2] + [3] * 6, "end with 5 or more steps that change nothing: cut them off"),
+        (9, [0, 0, 2, 2, 4, 4, 6, 6, 8], "repeat every other frame: is the camera slower"),
+        (51, range(51), None),
+        (9, [0] * 5 + [1, 1, 1, 1], None),
+    ],
+)
+def test_episodes_that_are_not_cut_or_at_another_rate_are_named(tmp_path, length, order, doubt):
+    """Four steps without change may be part of a task."""
+    frames = episode_of(length, keys=("pixels",))["pixels"]
+    with warnings.catch_warnings(record=True) as caught:
+        write(
+            tmp_path / "own",
+            {TASKS[0]: [{"pixels": frames[[*order]]}, episode_of(4, keys=("pixels",))]},
+        )
+    assert [doubt in str(one.message) for one in caught] == ([] if doubt is None else [True])
 
 
 def changed(**entries):

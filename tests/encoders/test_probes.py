@@ -5,10 +5,12 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
+from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.probes import (
@@ -23,6 +25,7 @@ from bgpo_trl.encoders.probes import (
 )
 from bgpo_trl.encoders.representation import Representation, doubt_frames, encode_frames
 from bgpo_trl.encoders.train import make_bank
+from bgpo_trl.modules.frame_network import FrameNetwork
 from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
@@ -69,6 +72,7 @@ def test_demonstrations_unlike_those_of_the_encoders_are_told(tmp_path: Path) ->
     latent, action = encode_frames(encoders.frame_network, dataset), dataset["action"]
     inferred = encoders.inverse(latent, dataset["length"])
     none, network = torch.zeros_like(action[:, :1]), encoders.frame_network
+    phi = encoders.lae.encode(latent, dataset["length"])
     for changed, said in (
         (action, None),
         (torch.cat([none, action[:, :-1]], 1), "a step too late"),
@@ -79,7 +83,7 @@ def test_demonstrations_unlike_those_of_the_encoders_are_told(tmp_path: Path) ->
         (action + torch.tensor([0.0, 0.0, 0.3, 0.0]), r"component 2 .* is \+0.\d+ off"),
         (torch.rand_like(action) - 0.5, "little to do with what frames show"),
     ):
-        found = mismatch(network, dataset.clone().update({"action": changed}), inferred)
+        found = mismatch(network, dataset.clone().update({"action": changed}), inferred, phi)
         assert re.search(said, found) if said else not found, found
     shown = dataset["pixels"][0, : dataset["length"][0]]
     wide = shown.float()
@@ -99,6 +103,34 @@ def test_demonstrations_unlike_those_of_the_encoders_are_told(tmp_path: Path) ->
     blue = dataset.clone().update({"pixels": dataset["pixels"].flip(-1)}).exclude("action")
     with pytest.warns(UserWarning, match="better with red and blue exchanged"):
         make_bank(encoders, blue, tasks=NICO.default_tasks)
+
+
+class Blind(FrameNetwork):
+    """A frame encoder without a decoder, of which nothing else can be told."""
+
+    identity = "blind 1"
+
+    def features(self, frames: torch.Tensor) -> torch.Tensor:
+        return torch.zeros(len(frames), 64)
+
+
+def test_tasks_that_are_mixed_up_are_told(bank: DemonstrationBank) -> None:
+    """Unless there are fewer than eight demonstrations for each task."""
+    frames = torch.zeros(len(bank.task), 2, 32, 64, 3, dtype=torch.uint8)
+    length = torch.full([len(bank.task)], 2)
+    shown = TensorDict({"pixels": frames, "length": length, "task": bank.task}, [len(frames)])
+
+    def found(task: torch.Tensor, n: int) -> str:
+        some = shown.clone().set("task", task)[:n]
+        return mismatch(Blind(64, (32, 64)), some, None, bank.embedding[:n])
+
+    assert found(bank.task, 36) == ""
+    mixed = torch.where(torch.arange(36) % 4 == 0, bank.task.roll(1), bank.task)
+    phi = bank.embedding.numpy()
+    apart = np.linalg.norm(phi[:, None] - phi, axis=-1) + 1e9 * np.eye(36)
+    own = (mixed.numpy()[apart.argmin(1)] == mixed.numpy()).mean()
+    assert found(mixed, 36).startswith(f"{own:.0%} of the demonstrations are nearest to one of")
+    assert found(mixed, 23) == ""
 
 
 def test_picture_shows_frames_over_reconstructions(untrained: Representation) -> None:
