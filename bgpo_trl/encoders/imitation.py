@@ -12,6 +12,7 @@ _NOISES = (0.0, 0.02, 0.05, 0.1, 0.2)
 _FEWEST, _MOST = 8, 125  # demonstrations of a task, of which a fifth judges
 _N_UPDATES, _N_ROWS = 500, 128
 _AS_GOOD = 1.01
+_NO_ERROR = 1e-4  # squared; of actions in [-1, 1]
 
 
 def choose_noise(bank: DemonstrationBank) -> float | None:
@@ -34,6 +35,8 @@ def choose_noise(bank: DemonstrationBank) -> float | None:
     if seen.steps is None or len(count) == 0 or int(count.min()) < _FEWEST:
         return None
     error = torch.stack([_errors(seen.of_task(task)) for task in range(len(bank.tasks))])
+    # Of actions that are always the same, no clone errs.
+    error = error.clamp_min(_NO_ERROR)
     relative = (error / error.amin(1, keepdim=True)).mean(0)
     good = relative <= _AS_GOOD * relative.min()
     return max(noise for noise, kept in zip(_NOISES, good.tolist(), strict=True) if kept)

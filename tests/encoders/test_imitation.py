@@ -36,7 +36,14 @@ def by_heart():
     return bank_of(latent, (0.1 * latent[:, :-1, :2] + tremor).clamp(-1, 1))
 
 
-@pytest.mark.parametrize(("made", "least", "most"), [(fine, 0.0, 0.05), (by_heart, 0.2, 0.2)])
+def constant():
+    """Actions are always the same, and so large that a clone meets them exactly."""
+    return bank_of(latents(16), torch.ones(16, N_STEPS, 2))
+
+
+@pytest.mark.parametrize(
+    ("made", "least", "most"), [(fine, 0.0, 0.05), (by_heart, 0.2, 0.2), (constant, 0.2, 0.2)]
+)
 def test_noise_suits_what_demonstrations_need(made, least, most):
     bank = made()
     noise = choose_noise(bank)
