@@ -40,6 +40,7 @@ from bgpo_trl.scenes import Scene, StateColumns
 _SEARCHED = 300  # frames in which things are looked for
 _STANDS_OUT, _THING = 0.15, 4  # deviation of a pixel in the range of colors; least pixels
 _ALIKE = 0.5  # correlation of actions from which a comparison means something
+_OFF = 0.25  # mean difference of recorded from inferred actions that says something
 _OWN_TASK = 0.9  # share of demonstrations that are nearest to one of their own task
 _COMPARED = 256  # frames that are compared, about
 
@@ -327,7 +328,7 @@ def _doubt_actions(recorded: Tensor, inferred: Tensor, length: Tensor) -> str:
             "give what the robot was told at each step, as in the encoders' demonstrations"
         )
     for component, offset in enumerate((given - own).mean(0).tolist()):
-        if abs(offset) > _ALIKE * own[:, component].std():
+        if abs(offset) > _OFF:
             return (
                 f"component {component} of recorded actions is {offset:+.2f} off what frames "
                 "show, on average: scale it as in the encoders' demonstrations"
