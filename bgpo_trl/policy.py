@@ -26,11 +26,8 @@ from bgpo_trl.algorithms.environments import beside_joints, clip, encode
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.dataset import resize_frames
-from bgpo_trl.encoders.representation import (
-    Representation,
-    doubt_frames,
-    embed_demonstrations,
-)
+from bgpo_trl.encoders.mismatch import doubt_frames
+from bgpo_trl.encoders.representation import Representation, embed_demonstrations
 from bgpo_trl.files.writing import make_folder, write_whole
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.demonstrations import load_inputs

@@ -13,11 +13,8 @@ import torch
 from tensordict import TensorDict
 
 from bgpo_trl.encoders.fitting import train_representation
-from bgpo_trl.encoders.representation import (
-    doubt_frames,
-    load_representation,
-    save_representation,
-)
+from bgpo_trl.encoders.mismatch import doubt_frames
+from bgpo_trl.encoders.representation import load_representation, save_representation
 from bgpo_trl.modules.frame_network import FRAME_NETWORKS, FrameNetwork
 from bgpo_trl.training import Trainer
 from tests.helpers import TINY_ENCODERS, rows

@@ -22,7 +22,6 @@ from torch import Tensor
 
 from bgpo_trl.encoders.representation import (
     Representation,
-    doubt_frames,
     encode_frames,
     mean_frame,
     split,
@@ -37,12 +36,10 @@ from bgpo_trl.modules.vae import VAE
 from bgpo_trl.objectives.supervised import sequence_reconstruction_loss
 from bgpo_trl.scenes import Scene, StateColumns
 
+OWN_TASK = 0.9
+"""Least share of demonstrations that are nearest to one of their own task."""
 _SEARCHED = 300  # frames in which things are looked for
 _STANDS_OUT, _THING = 0.15, 4  # deviation of a pixel in the range of colors; least pixels
-_ALIKE = 0.5  # correlation of actions from which a comparison means something
-_OFF = 0.25  # mean difference of recorded from inferred actions that says something
-_OWN_TASK = 0.9  # share of demonstrations that are nearest to one of their own task
-_COMPARED = 256  # frames that are compared, about
 
 
 def probe(
@@ -173,7 +170,7 @@ _CHECKS = (
     _Check(
         "task_accuracy_nearest",
         "nearest demonstration is of the same task",
-        _OWN_TASK,
+        OWN_TASK,
         "{task_accuracy_nearest:.0%} of the held-out demonstrations are nearest to one of their "
         "own task, {task_accuracy_chance:.0%} by chance: groups of behaviors will mix tasks; show "
         "objects larger, train longer (vae.steps, lae.steps), or record more demonstrations, or "
@@ -243,103 +240,6 @@ def verdict_in(folder: Path, scene: Scene) -> str:
     picture = folder / "reconstructions.png"
     look = f"\nlook for every object in {picture}" if picture.exists() else ""
     return f"{verdict(judged(result, scene))}{look}"
-
-
-@torch.no_grad()
-def mismatch(
-    network: FrameNetwork, dataset: TensorDictBase, inferred: Tensor | None, embedding: Tensor
-) -> str:
-    """Return in what demonstrations seem unlike those that encoders were trained on, or "".
-
-    Recorded actions are compared with inferred ones, and frames with their reconstructions, each
-    also after what people get wrong: a step earlier or later, components exchanged, a mirrored
-    camera and the like. Demonstrations should be nearest to one of their own task. What leaves no
-    trace is not seen: tasks exchanged as a whole, or ends cut off.
-
-    Args:
-        network: The frame encoder.
-        dataset: Reads ``pixels``, ``length``, ``task`` and, if it is there, ``action``.
-        inferred: Actions of the inverse model for its frames ``[N, T - 1, A]``, or None.
-        embedding: Embeddings of the demonstrations, ``[N, 32]``.
-    """
-    length, recorded = dataset["length"], dataset.get("action", None)
-    every = max(1, int(length.sum()) // _COMPARED)
-    shown = {key: dataset[key][::every] for key in ("pixels", "length")}
-    some = TensorDict(shown, [len(shown["length"])])
-    doubt = doubt_frames(network, valid_frames(some)[:_COMPARED])
-    # From frames that are wrong, wrong actions are inferred.
-    if not doubt and inferred is not None and recorded is not None:
-        doubt = _doubt_actions(recorded, inferred, length)
-    return doubt or _doubt_tasks(embedding, dataset["task"])
-
-
-def _doubt_tasks(embedding: Tensor, task: Tensor) -> str:
-    """Return that tasks ``[N]`` of nearest embeddings ``[N, 32]`` differ too often, or ""."""
-    some = torch.arange(len(task))[:: len(task) // 2_000 + 1]
-    embedding, task = embedding[some], task[some]
-    nearest = torch.cdist(embedding, embedding).fill_diagonal_(torch.inf).argmin(1)
-    own = float((task[nearest] == task).float().mean())
-    # Of few, none of the same task need be near.
-    if own >= _OWN_TASK or len(task) < 8 * len(task.unique()):
-        return ""
-    return (
-        f"{own:.0%} of the demonstrations are nearest to one of their own task: are tasks mixed "
-        "up, or do the encoders not tell them apart?"
-    )
-
-
-def _doubt_actions(recorded: Tensor, inferred: Tensor, length: Tensor) -> str:
-    """Return in what recorded actions ``[N, T - 1, A]`` differ from inferred ones, or ""."""
-
-    def correlation(one: Tensor, other: Tensor) -> float:
-        return float((one * other).sum() / (one.norm() * other.norm()).clamp_min(1e-9))
-
-    moves = valid_steps(length - 1, recorded.shape[1])
-    later = moves[:, 1:]
-    now = correlation(recorded[moves], inferred[moves])
-    late = correlation(recorded[:, 1:][later], inferred[:, :-1][later])
-    early = correlation(recorded[:, :-1][later], inferred[:, 1:][later])
-    if max(late, early) > max(now + 0.1, _ALIKE):
-        when = "late" if late > early else "early"
-        return (
-            f"recorded actions seem to be a step too {when} (correlation with what frames show: "
-            f"{now:.2f}, shifted {max(late, early):.2f}): action t leads from frame t to t + 1"
-        )
-    given, own = recorded[moves], inferred[moves]
-    alike = torch.tensor(
-        [[correlation(one, other) for other in own.unbind(-1)] for one in given.unbind(-1)]
-    )
-    strongest = alike.abs().argmax(1).tolist()
-    for component, other in enumerate(strongest):
-        found = float(alike[component, other])
-        if component != other and abs(found) > max(_ALIKE, 2 * abs(alike[component, component])):
-            return (
-                f"component {component} of recorded actions moves what component {other} moved in "
-                f"the encoders' demonstrations (correlation {found:.2f}): exchange them"
-            )
-        if component == other and found < -_ALIKE:
-            return (
-                f"component {component} of recorded actions has the opposite sign of what frames "
-                f"show (correlation {found:.2f}): turn it round"
-            )
-    if now < _ALIKE:
-        return (
-            f"recorded actions have little to do with what frames show (correlation {now:.2f}): "
-            "give what the robot was told at each step, as in the encoders' demonstrations"
-        )
-    for component, offset in enumerate((given - own).mean(0).tolist()):
-        if abs(offset) > _OFF:
-            return (
-                f"component {component} of recorded actions is {offset:+.2f} off what frames "
-                "show, on average: scale it as in the encoders' demonstrations"
-            )
-    scale = float((given * own).sum() / own.square().sum().clamp_min(1e-9))
-    if not 0.75 < scale < 1.33:
-        return (
-            f"recorded actions are {scale:.2f} times as large as frames suggest: scale them as "
-            "those of the encoders' demonstrations, and give as many frames a second"
-        )
-    return ""
 
 
 def ridge_predict(x: Tensor, y: Tensor, x_new: Tensor, penalty: float = 1e-4) -> Tensor:

@@ -17,8 +17,9 @@ from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.fitting import Log, retrain_inverse, train_representation
 from bgpo_trl.encoders.imitation import choose_noise
+from bgpo_trl.encoders.mismatch import mismatch
 from bgpo_trl.encoders.pretrained import bank_path
-from bgpo_trl.encoders.probes import complaints, judged, mismatch, probe
+from bgpo_trl.encoders.probes import complaints, judged, probe
 from bgpo_trl.encoders.representation import (
     Representation,
     encode_frames,

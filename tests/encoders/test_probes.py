@@ -12,10 +12,10 @@ from tensordict import TensorDict
 
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders.mismatch import doubt_frames, mismatch
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.probes import (
     complaints,
-    mismatch,
     probe,
     reconstruction_picture,
     ridge_predict,
@@ -23,7 +23,7 @@ from bgpo_trl.encoders.probes import (
     verdict,
     verdict_in,
 )
-from bgpo_trl.encoders.representation import Representation, doubt_frames, encode_frames
+from bgpo_trl.encoders.representation import Representation, encode_frames
 from bgpo_trl.encoders.train import make_bank
 from bgpo_trl.modules.frame_network import FrameNetwork
 from bgpo_trl.modules.inverse_model import InverseModel
