@@ -260,7 +260,7 @@ class Fit:
         if saved["config"] != self._settings:
             raise ValueError(
                 f"{path} was written with another configuration or frame network: "
-                "remove it or choose another checkpoint folder"
+                "remove it or choose another folder (--folder)"
             )
         network.load_state_dict(saved["network"])
         optimizer.load_state_dict(saved["optimizer"])

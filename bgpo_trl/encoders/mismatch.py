@@ -87,13 +87,13 @@ def _doubt_actions(recorded: Tensor, inferred: Tensor, length: Tensor) -> str:
         found = float(alike[component, other])
         if component != other and abs(found) > max(_ALIKE, 2 * abs(alike[component, component])):
             return (
-                f"component {component} of recorded actions moves what component {other} moved in "
-                f"the encoders' demonstrations (correlation {found:.2f}): exchange them"
+                f"component {component} (from 0) of recorded actions moves what component {other} "
+                f"moved in the encoders' demonstrations (correlation {found:.2f}): exchange them"
             )
         if component == other and found < -_ALIKE:
             return (
-                f"component {component} of recorded actions has the opposite sign of what frames "
-                f"show (correlation {found:.2f}): turn it round"
+                f"component {component} (from 0) of recorded actions has the opposite sign of what "
+                f"frames show (correlation {found:.2f}): turn it round"
             )
     if now < _ALIKE:
         return (
@@ -103,8 +103,8 @@ def _doubt_actions(recorded: Tensor, inferred: Tensor, length: Tensor) -> str:
     for component, offset in enumerate((given - own).mean(0).tolist()):
         if abs(offset) > _OFF:
             return (
-                f"component {component} of recorded actions is {offset:+.2f} off what frames "
-                "show, on average: scale it as in the encoders' demonstrations"
+                f"component {component} (from 0) of recorded actions is {offset:+.2f} off what "
+                "frames show, on average: scale it as in the encoders' demonstrations"
             )
     scale = float((given * own).sum() / own.square().sum().clamp_min(1e-9))
     if not 0.75 < scale < 1.33:

@@ -167,7 +167,7 @@ def load_representation(path: str | Path, *, scene: Scene | None = None) -> Repr
             module has the version of its frame network.
     """
     path = Path(path)
-    remedy = "train new ones with --train-encoders"
+    remedy = "train some with `bgpo encoders` or --train-encoders"
     try:
         tensors, metadata = load_tensors(path)
         encoders = _of_tensors(tensors, metadata)

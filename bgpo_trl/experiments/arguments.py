@@ -34,7 +34,7 @@ class BankArguments(ImportArguments):
     """Robot with its tasks, nico by default, or one that the module of --import adds."""
     tasks: tuple[str, ...] | None = None
     """Tasks in the order of presentation, or "all" for all of the scene; by default its usual ones,
-    for NICO the paper's three. In runs, unless there are three, they start at even intervals."""
+    for NICO the paper's three. Three tasks start as in the paper, others at even intervals."""
     encoders: Path | None = None
     """Encoders trained by `bgpo encoders`, with their bank beside them; those that come
     with the scene by default. With --resume, the run's own."""
@@ -51,9 +51,9 @@ class Arguments(BankArguments):
     summary.json, checkpoint/ and figures/, among them success.png (success on each task against
     training episodes), gwr.png (nodes of GWR-B in behavior space, Fig. 7) and groups.png.
 
-    Flags go before the file of --config, and this before --preset. All settings of config.json are
-    flags, such as --seeds 0 1, --algorithm.beta 0.2 or --algorithm.rl.noise 0.1; --help lists these
-    flags last.
+    A flag overrides the file of --config, and the file overrides --preset. All settings of
+    config.json are flags, such as --seeds 0 1, --algorithm.beta 0.2 or --algorithm.rl.noise 0.1;
+    --help lists these flags last.
     """
 
     algorithm: str | None = None

@@ -91,8 +91,8 @@ class _Trial:
             ]
             if not any(differ(*pair) for pair in pairs):
                 doubts.append(
-                    f"component {component} of actions changes no frame within {_N_STEPS} steps: "
-                    "does it move something that the camera sees?"
+                    f"component {component} (from 0) of actions changes no frame within {_N_STEPS} "
+                    "steps: does it move something that the camera sees?"
                 )
             prompt |= any(differ(*pair) for pair in pairs[::_N_STEPS])
             self.start(simulation, 0)

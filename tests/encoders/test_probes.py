@@ -79,7 +79,10 @@ def test_demonstrations_unlike_those_of_the_encoders_are_told(tmp_path: Path) ->
         (torch.cat([action[:, 1:], none], 1), "a step too early"),
         (0.2 * action, "0.20 times as large as frames suggest"),
         (action * torch.tensor([1.0, -1.0, 1.0, 1.0]), "component 1 .* opposite sign"),
-        (action[..., [1, 0, 2, 3]], "component 0 of recorded actions moves what component 1 moved"),
+        (
+            action[..., [1, 0, 2, 3]],
+            "component 0 \(from 0\) of recorded actions moves what component 1 moved",
+        ),
         (action + torch.tensor([0.0, 0.0, 0.3, 0.0]), r"component 2 .* is \+0.\d+ off"),
         (torch.rand_like(action) - 0.5, "little to do with what frames show"),
     ):
