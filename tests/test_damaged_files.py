@@ -71,7 +71,7 @@ def read_bank(folder: Path) -> dict[str, torch.Tensor]:
     bank |= {key: value for key, value in steps.items() if value is not None}
     texts = {key: bank[key] for key in ("encoder_id", "scene")}
     texts["tasks"] = ",".join(bank["tasks"])
-    bank["spread"] = torch.tensor(bank["spread"])
+    bank |= {key: torch.tensor(bank[key]) for key in ("spread", "noise")}
     return bank | {key: torch.tensor(list(text.encode())) for key, text in texts.items()}
 
 

@@ -238,8 +238,9 @@ def test_the_identity_is_that_of_the_demonstrations(bank, tmp_path):
         replace(some, steps=None),
         replace(some, embedding=some.embedding + 1e-6),
         replace(some, train=~some.train),
+        replace(some, noise=0.1),
     ]
-    assert len({some.identity, *(other.identity for other in others)}) == 6
+    assert len({some.identity, *(other.identity for other in others)}) == 7
 
 
 def test_the_command_keeps_the_names_of_the_tasks(tmp_path, encoders, monkeypatch):

@@ -8,6 +8,7 @@ import pytest
 from one_shot import OneShotArguments, one_shot
 
 from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.data import recording
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.experiments.command_line import import_plugin
@@ -85,6 +86,7 @@ def test_a_task_and_an_algorithm_of_a_module_are_trained_reported_filmed_and_tes
 ):
     own = replace(bank.for_tasks(nico.PAPER_TASKS[:1]), tasks=("at_once",))
     monkeypatch.setattr(experiment, "load_pretrained", lambda *_, **__: (encoders, own))
+    monkeypatch.setattr(recording, "check_scene", lambda *_: [])  # which refuses such a task
     asked = Arguments(algorithm="mine", tasks=("at_once",), episodes=4)
     with pytest.raises(ValueError, match="'mine'"):
         continual(asked)
