@@ -101,7 +101,7 @@ def test_files_that_do_not_belong_together_are_refused(made, copy, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setitem(SCENES, "nico", replace(NICO, version="another"))
         with pytest.raises(
-            ValueError, match=r"is of the scene nico nico-2.*this is nico another: train new"
+            ValueError, match=r"is of the scene nico nico-2.*this is nico another: train some"
         ):
             load_pretrained(copy)
     with torch.random.fork_rng(devices=[]):
