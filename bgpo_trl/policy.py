@@ -175,7 +175,7 @@ class TrainedPolicy:
                 f"{scene.max_steps + 1}: give as many frames a second as the scene has steps",
                 stacklevel=3,  # of the call before no_grad's
             )
-        if doubt := doubt_frames(self.encoders.frame_network, frames[:: len(frames) // 16 + 1]):
+        if doubt := doubt_frames(self.encoders.frame_network, frames[:: len(frames) // 4 + 1]):
             warnings.warn(doubt, stacklevel=3)
         algorithm, index = self.algorithm, self._index
         if task is None and algorithm.needs_label:

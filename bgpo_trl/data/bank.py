@@ -176,9 +176,8 @@ class DemonstrationBank:
     @property
     def identity(self) -> str:
         """Digest of the demonstrations and their noise, without the names of their tasks."""
-        usual = self.noise == DemonstrationBank.noise
-        noise = {} if usual else {"noise": torch.tensor(self.noise, dtype=torch.float64)}
-        return digest({**self._tensors(), **noise})
+        noise = torch.tensor(self.noise, dtype=torch.float64)
+        return digest({**self._tensors(), "noise": noise})
 
     def seen(self, most: int = 0) -> DemonstrationBank:
         """Return the demonstrations for training episodes, or the first ``most`` of each task.

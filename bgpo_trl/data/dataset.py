@@ -414,7 +414,8 @@ def _check_episodes(
 def _doubts(scene: Scene, episode: Mapping[str, Any], known: set[bytes]) -> Iterator[str]:
     """Yield what is doubtful about an episode, given the digests of the frames of earlier ones."""
     pixels = np.ascontiguousarray(episode["pixels"])
-    if (pixels == pixels[0]).all():
+    repeated = (pixels[1:] == pixels[:-1]).all((1, 2, 3))
+    if repeated.all():
         yield "show one frame throughout: did the camera stand still?"
     content = hashlib.sha256(pixels.data).digest()
     if content in known:
@@ -422,12 +423,10 @@ def _doubts(scene: Scene, episode: Mapping[str, Any], known: set[bytes]) -> Iter
     known.add(content)
     if len(pixels) > scene.max_steps + 1:
         yield f"have more steps than the scene's {scene.max_steps}: at another rate, or not cut?"
-    repeated = (pixels[1:] == pixels[:-1]).all((1, 2, 3))
     if len(repeated) > _IDLE and (repeated[1:] != repeated[:-1]).all():
         yield "repeat every other frame: is the camera slower than the actions?"
-    for end, frames in ("begin", pixels), ("end", pixels[::-1]):
-        still = int((frames == frames[0]).all((1, 2, 3)).cumprod().sum()) - 1
-        if _IDLE <= still < len(pixels) - 1:
+    for end, still in ("begin", repeated), ("end", repeated[::-1]):
+        if still[:_IDLE].all() and not still.all():
             yield f"{end} with {_IDLE} or more steps that change nothing: cut them off"
     if scene.joints is not None and "joints" in episode:
         apart = np.abs(np.asarray(episode["joints"]) - scene.joints.center)

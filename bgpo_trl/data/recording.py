@@ -211,7 +211,7 @@ def perform(
     actions, success = [], False
     for _ in range(scene.max_steps):
         action = np.array(act())  # a copy, since a policy may use its array again
-        # What a simulation makes of others is its own.
+        # Every simulation would make something else of such an action.
         if action.shape != (scene.action_size,) or not np.isfinite(action).all():
             raise ValueError(
                 f"an episode of the demonstrator of {task!r} has the action "

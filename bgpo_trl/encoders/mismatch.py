@@ -133,7 +133,7 @@ def _brighter(factor: float) -> Callable[[Tensor], Tensor]:
 
 _RED = "give them red first (OpenCV's are blue first, frame[..., ::-1] turns them)"
 _CAMERA = "place and set the camera as for the encoders' demonstrations, or train encoders anew"
-# What may be wrong with frames: what they fit better with, how to get there, and what to do.
+# By what frames would fit better: the change that makes them so, and the remedy.
 _CHANGES: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
     "with red and blue exchanged": (lambda frames: frames.flip(-1), _RED),
     "mirrored": (lambda frames: frames.flip(2), _CAMERA),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,16 +33,16 @@ def check_scene(scene: Scene, tasks: Sequence[str] | None = None) -> list[str]:
             step without movement, or the simulation returns what `Simulation` does not allow.
     """
     tasks = scene.default_tasks if tasks is None else tasks
-    env = scene.simulate(tasks, batch_size=1)
-    if isinstance(env, RobotEnv):
-        return []
-    other = scene.simulate(tasks, batch_size=1)
-    simulations = (env.simulations[0], other.simulations[0])
-    try:
+    # A physical robot has one connection, so it is closed before the next environment is made.
+    with ExitStack() as opened:
+        simulations = list[Simulation]()
+        for _ in range(2):
+            env = scene.simulate(tasks, batch_size=1)
+            opened.callback(env.close)
+            if isinstance(env, RobotEnv):
+                return []
+            simulations += env.simulations
         doubts = [doubt for task in tasks for doubt in _Trial(scene, task).doubts(*simulations)]
-    finally:
-        env.close()
-        other.close()
     return list(dict.fromkeys(doubts))
 
 
@@ -107,10 +108,7 @@ class _Trial:
         return doubts
 
     def play(
-        self,
-        simulation: Simulation,
-        seed: int,
-        action: NDArray[np.float64],
+        self, simulation: Simulation, seed: int, action: NDArray[np.float64]
     ) -> list[NDArray[np.uint8]]:
         """Return the frames after some steps with an action; an episode's last one stays."""
         self.start(simulation, seed)

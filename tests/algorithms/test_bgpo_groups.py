@@ -21,6 +21,21 @@ def test_with_one_group_it_is_the_plain_learner_bit_for_bit(make_bgpo):
     assert_same(plain.learner.state_dict(), one.learner.state_dict())
 
 
+@pytest.mark.parametrize(("asked", "noise"), [(None, 0.4), (0.3, 0.3), (0.0, 0.0)])
+def test_imitated_states_get_the_noise_of_the_bank_or_the_one_asked_for(
+    make_bgpo, bank, asked, noise
+):
+    """Told by how far they are from each frame of the bank."""
+    noisy = replace(bank, noise=0.4)
+    algorithm = make_bgpo("all", bank=noisy, demonstration_noise=asked)
+    play(algorithm, 30)
+    group = algorithm.active.group[:, :1, None].expand(-1, -1, 500)
+    drawn = algorithm.shown.draw_actions(group)["latent"]
+    frames = bank.steps.latents(torch.arange(len(bank.steps.latent)))
+    apart = torch.cdist(drawn.flatten(0, 2), frames).amin(1) / 64**0.5
+    assert float(apart.mean()) == pytest.approx(noise, abs=0.02)
+
+
 def test_joined_groups_have_one_expert_and_one_replay(make_bgpo, bank):
     algorithm = make_bgpo("all", schedule=TaskSchedule((0, 0, 0)), known=15)
     _, state = play(algorithm, 60)

@@ -208,6 +208,26 @@ def test_a_bank_is_made_of_what_the_encoders_see(encoders):
         torch.testing.assert_close(recorded.steps.actions(moves), exact, rtol=0, atol=0.005)
 
 
+@pytest.mark.filterwarnings("ignore:frames fit")
+@pytest.mark.parametrize(("chosen", "noise"), [(0.05, 0.05), (0.0, 0.0), (None, 0.2)])
+def test_a_bank_has_the_noise_that_suits_its_steps(encoders, monkeypatch, chosen, noise):
+    """Or the usual one, if nothing can be told."""
+    given = []
+    monkeypatch.setattr(
+        "bgpo_trl.encoders.train.choose_noise", lambda bank: given.append(bank) or chosen
+    )
+    shown = {
+        "pixels": torch.zeros(2, 3, 32, 64, 3, dtype=torch.uint8),
+        "action": torch.rand(2, 2, 4),
+        "length": torch.tensor([3, 3]),
+        "task": torch.tensor([0, 0]),
+        "train": torch.tensor([True, True]),
+    }
+    bank = make_bank(encoders, shown, tasks=nico.PAPER_TASKS[:1])
+    assert bank.noise == noise
+    assert_same(given[0].steps, bank.steps)
+
+
 def test_the_banks_steps_are_those_of_its_embeddings():
     """phi anew from the latents of the shipped bank: rounding moves it hardly."""
     encoders, bank = load_pretrained()

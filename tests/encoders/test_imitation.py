@@ -7,6 +7,8 @@ import torch
 
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.encoders.imitation import choose_noise
+from bgpo_trl.encoders.pretrained import load_pretrained
+from suites import nico
 
 N_LATENTS, N_STEPS = 32, 20
 
@@ -50,6 +52,13 @@ def test_noise_suits_what_demonstrations_need(made, least, most):
     assert least <= noise <= most
     twin = replace(bank, tasks=("reach", "push"), task=torch.arange(len(bank.task)) % 2)
     assert least <= choose_noise(twin) <= most
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tasks", [nico.PAPER_TASKS, nico.ALL_TASKS])
+def test_shipped_banks_have_the_noise_that_would_be_chosen(tasks):
+    bank = load_pretrained(tasks=tasks)[1]
+    assert choose_noise(bank) == bank.noise
 
 
 def test_of_too_few_demonstrations_nothing_is_told():

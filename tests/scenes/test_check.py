@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.scenes import Outcome, find_scene
+from bgpo_trl.scenes import Outcome, RobotEnv, find_scene
 from bgpo_trl.scenes.check import check_scene
 from tests.scenes.dot import Dot, scene
 
@@ -107,6 +107,20 @@ def test_what_is_wrong_is_not_recorded(make, reason, tmp_path):
     with pytest.raises(ValueError, match=reason):
         record_demonstrations(tmp_path, scene=scene(make), progress=False)
     assert not [*tmp_path.iterdir()]
+
+
+def test_a_physical_robot_is_not_moved_and_its_connection_is_closed():
+    moved, closed = [], []
+
+    class Robot(Dot):
+        def reset(self, task):
+            moved.append(task)
+
+        def close(self):
+            closed.append(self)
+
+    assert check_scene(scene(Robot, env=RobotEnv)) == []
+    assert (moved, len(closed)) == ([], 1)
 
 
 def test_nico_is_in_order():
