@@ -49,6 +49,9 @@ class VAEConfig(FitConfig):
     others compute in float32."""
     reconstruction_weight: float = 1.0
     """Factor of the squared error summed over a frame. Ours: the unit of the other weights."""
+    foreground_weight: float = 20.0
+    """Further weight of a pixel's error, times its difference to the mean training frame (black and
+    white differ by 1). Ours: without it, small objects are found last (docs/learning.md)."""
     kl_weight: float = 0.01
     """Factor of the KL divergence summed over dimensions. Ours: a larger one drops the objects,
     which are 5 pixels wide."""
@@ -58,7 +61,8 @@ class VAEConfig(FitConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least(self, 1, "latent_size", "batch_size", "steps")
-        at_least(self, 0, "reconstruction_weight", "kl_weight", "inverse_weight")
+        weights = "reconstruction_weight", "foreground_weight", "kl_weight", "inverse_weight"
+        at_least(self, 0, *weights)
         at_least(self, 2, "window")
         divides = self.batch_size % self.window == 0
         check(self, ("window", divides, f"a divisor of batch_size {self.batch_size}"))

@@ -325,6 +325,7 @@ def _train_vae(datasets: Sequence[TensorDictBase], fit: Fit) -> VAE:
     loss_of = partial(
         vae_inverse_loss,
         reconstruction_weight=config.reconstruction_weight,
+        foreground_weight=config.foreground_weight,
         kl_weight=config.kl_weight,
         inverse_weight=config.inverse_weight,
         generator=generator,

@@ -28,6 +28,7 @@ def vae_inverse_loss(
     windows: TensorDictBase,
     *,
     reconstruction_weight: float = 1.0,
+    foreground_weight: float = 0.0,
     kl_weight: float = 0.01,
     inverse_weight: float = 1.0,
     generator: torch.Generator | None = None,
@@ -50,13 +51,16 @@ def vae_inverse_loss(
             ``action_known`` bool ``[*B]``, by default true: the actions of somebody else's
             demonstration are unknown.
         reconstruction_weight: Weight of ``reconstruction``.
+        foreground_weight: Further weight, in ``loss_reconstruction``, of a pixel's error, times its
+            largest difference to ``vae.mean_frame``, so that small objects count beside what varies
+            little everywhere.
         kl_weight: Weight of ``kl``.
         inverse_weight: Weight of ``inverse``.
         generator: Source of the sampling noise; None: torch's default generator.
 
     Returns:
-        The terms ``[]``: detached, for logging, and weighted as ``loss_*``, which add up to the
-        objective.
+        The terms ``[]``: detached and without weights, for logging, and weighted as ``loss_*``,
+        which add up to the objective.
 
     Raises:
         ValueError: If a window has fewer than 2 frames, an entry is missing, or actions have
@@ -75,7 +79,8 @@ def vae_inverse_loss(
     mu, log_variance = vae.encode(pixels)
     noise = torch.randn(mu.shape, generator=generator).to(mu.device)
     z = mu + noise * (log_variance / 2).exp()
-    residual = vae.decode(z) - pixels / 255
+    frames = pixels / 255
+    error = (vae.decode(z) - frames).square()
     # Consecutive latents differ too little for the precision of autocast.
     with torch.autocast(z.device.type, enabled=False):
         predicted = vae.inverse(z[..., :-1, :], z[..., 1:, :])
@@ -88,15 +93,21 @@ def vae_inverse_loss(
     if known is None:
         known = torch.ones(pixels.shape[:-4], dtype=torch.bool, device=pixels.device)
     squared = (predicted - action[..., :-1, :]).square().sum(-1).mean(-1)
+    counted = error
+    if foreground_weight:
+        difference = (frames - vae.mean_frame).abs().amax(-1, keepdim=True)
+        counted = error * (1 + foreground_weight * difference)
+    kl = (mu.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean() / 2
+    inverse = (squared * known).sum() / known.sum().clamp_min(1) / 2
     terms = {
-        "reconstruction": residual.square().sum((-3, -2, -1)).mean(),
-        "kl": (mu.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean() / 2,
-        "inverse": (squared * known).sum() / known.sum().clamp_min(1) / 2,
+        "loss_reconstruction": reconstruction_weight * counted.sum((-3, -2, -1)).mean(),
+        "loss_kl": kl_weight * kl,
+        "loss_inverse": inverse_weight * inverse,
+        "reconstruction": error.detach().sum((-3, -2, -1)).mean(),
+        "kl": kl.detach(),
+        "inverse": inverse.detach(),
     }
-    weights = (reconstruction_weight, kl_weight, inverse_weight)
-    pairs = zip(weights, terms.items(), strict=True)
-    weighted = {f"loss_{name}": weight * term for weight, (name, term) in pairs}
-    return TensorDict({**weighted, **{name: term.detach() for name, term in terms.items()}}, [])
+    return TensorDict(terms, [])
 
 
 def action_inference_loss(inverse: InverseModel, batch: TensorDictBase) -> TensorDict:

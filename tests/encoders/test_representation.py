@@ -39,7 +39,7 @@ CONFIG = RepresentationConfig(
     vae=VAEConfig(
         batch_size=16,
         window=2,
-        steps=100,
+        steps=130,
         learning_rate=2e-3,
         warmup_steps=10,
         kl_weight=0.01,
@@ -136,7 +136,7 @@ def test_encoders_capture_frames_places_actions_and_tasks(
 ) -> None:
     """Held-out errors of the probes, against guessing the mean of the training set."""
     probed = probe(trained, dataset, columns=NICO.state)
-    assert probed["reconstruction"] < 0.75 * probed["mean_frame_reconstruction"]
+    assert probed["reconstruction"] < 0.6 * probed["mean_frame_reconstruction"]
     positions = [
         part["state"][torch.arange(51) < part["length"].unsqueeze(-1)] for part in split(dataset)
     ]

@@ -65,6 +65,19 @@ def test_hand_computed_numbers() -> None:
     assert result["loss_kl"].item() == pytest.approx(result["kl"].item() / 2)
 
 
+def test_pixels_that_differ_from_the_mean_frame_weigh_more() -> None:
+    vae = HandVAE(torch.zeros(1, 3, 2), torch.zeros(1, 3, 2), grey=0.3)
+    data = windows(1, 3, 2)
+    data["pixels"] = torch.full_like(data["pixels"], 51)  # 0.2
+    vae.mean_frame = torch.full((32, 64, 3), 0.2)
+    vae.mean_frame[3, 5] = torch.tensor([0.2, 0.5, 0.1])
+    vae.mean_frame[8, 9] = 0.25
+    result = vae_inverse_loss(vae, data, foreground_weight=7.0)  # type: ignore[arg-type]
+    assert result["reconstruction"].item() == pytest.approx(6144 * 0.1**2, rel=1e-4)
+    counted = (6144 + 7 * 3 * (0.3 + 0.05)) * 0.1**2
+    assert result["loss_reconstruction"].item() == pytest.approx(counted, rel=1e-4)
+
+
 def test_latents_are_sampled_with_the_posteriors_standard_deviation() -> None:
     """With actions zero the inverse loss is half the variance of z_next - z: sigma^2 a number."""
     mu, log_variance = torch.zeros(4, 3, 1000), torch.full((4, 3, 1000), 2 * math.log(0.3))
