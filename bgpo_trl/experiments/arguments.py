@@ -172,7 +172,7 @@ class MakeBankArguments(ImportArguments):
     """Folder of the recorded demonstrations."""
     out: tyro.conf.Positional[Path]
     """Bank to write."""
-    weights: Path | None = None
+    encoders: Path | None = None
     """Encoder weights; by default those that come with the scene."""
     actions: Literal["inferred", "recorded"] | None = None
     """Actions of the stored demonstrations, inferred from frames or recorded; by default as the
@@ -190,7 +190,7 @@ class ProbesArguments(ImportArguments):
     """Folder of the recorded demonstrations."""
     play: tyro.conf.Positional[Path | None] = None
     """Folder of recorded play."""
-    weights: Path | None = None
+    encoders: Path | None = None
     """Encoder weights; by default those of the scene for the dataset's tasks."""
     out: Path = Path("runs/probes")
     """Folder to write to."""
@@ -335,5 +335,7 @@ class GroupsArguments(BankArguments):
     """Demonstrations that each network is shown."""
     activity_scale: float = BGPOConfig().gwr.activity_scale
     """Factor of distances in the activity of GWR-B."""
+    group_evidence: float = BGPOConfig().group_evidence
+    """Depth of the valley of density between two groups, as --algorithm.group-evidence of a run."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds of the draws."""

@@ -88,7 +88,7 @@ def groups(arguments: GroupsArguments) -> str:
     """Measure the groups of behaviors that form from demonstrations, as `GroupsArguments` says."""
     torch.set_num_threads(1)
     check_draws(arguments.seeds, arguments.draws)
-    bank, config = bank_of(arguments), BGPOConfig()
+    bank, config = bank_of(arguments), BGPOConfig(group_evidence=arguments.group_evidence)
     fine = replace(config.gwr, activity_scale=arguments.activity_scale)
     n_tasks, seen, held_out = len(bank.tasks), bank.seen(), bank.held_out()
     forward = even_starts(n_tasks, arguments.draws)
@@ -127,7 +127,8 @@ def groups(arguments: GroupsArguments) -> str:
     n_networks = len(schedules) * len(arguments.seeds)
     lines = [
         f"{bank.tasks[one]} and {bank.tasks[other]} share a group in {count} of {n_networks}: show "
-        "more demonstrations, or better encoders (`bgpo probes` says what they lack)."
+        "more demonstrations, train better encoders (`bgpo probes` says what they lack), or lower "
+        "--group-evidence."
         for (one, other), count in shared.most_common()
     ]
     return "\n".join([markdown(table), "", *lines]).rstrip()

@@ -59,7 +59,7 @@ def _play(path: Path, scene: Scene) -> TensorDict:
 
 def bank(arguments: MakeBankArguments) -> None:
     """Embed a recorded dataset with trained encoders; see `make_bank`."""
-    meta, weights = read_meta(arguments.dataset), arguments.weights
+    meta, weights = read_meta(arguments.dataset), arguments.encoders
     scene = find_scene(meta["scene"])
     weights = default_weights(scene=scene) if weights is None else weights
     made = make_bank(
@@ -74,7 +74,7 @@ def bank(arguments: MakeBankArguments) -> None:
 
 def probes(arguments: ProbesArguments) -> str:
     """Evaluate trained encoders with probes; see `probe`."""
-    meta, weights = read_meta(arguments.dataset), arguments.weights
+    meta, weights = read_meta(arguments.dataset), arguments.encoders
     scene = find_scene(meta["scene"])
     weights = default_weights(meta["tasks"], scene=scene) if weights is None else weights
     representation = load_representation(weights, scene=scene)

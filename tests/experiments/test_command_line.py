@@ -85,7 +85,7 @@ CASES = [
     ("bgpo record new --per-task 0", "held_out_per_task"),
     ("bgpo bank absent new", "there is no dataset at absent"),
     ("bgpo encoders empty", "empty is not a dataset"),
-    ("bgpo probes empty --weights file", "empty is not a dataset"),
+    ("bgpo probes empty --encoders file", "empty is not a dataset"),
     ("bgpo encoders empty --settings file", "file must hold settings"),
     ("bgpo continual --encoder-settings file", "add --train-encoders"),
     # flags, in tyro's box

@@ -1,5 +1,6 @@
 """Groups that form from demonstrations."""
 
+import pytest
 import torch
 
 from bgpo_trl.configs.runs import PAPER_TASKS
@@ -43,6 +44,14 @@ def test_the_command_names_the_tasks_that_share_a_group(monkeypatch):
     printed = groups.groups(groups.GroupsArguments(draws=200, seeds=(0,)))
     last = printed.splitlines()[-1]
     assert last.startswith("task0 and task1 share a group in 4 of 4: show more demonstrations")
+
+
+@pytest.mark.parametrize(("evidence", "n_groups"), [(1.0, "2"), (0.3, "3")])
+def test_less_evidence_parts_tasks_that_are_close(evidence, n_groups, monkeypatch):
+    bank = places((0.0, 0.0), (0.2, 0.0), (9.0, 0.0))
+    monkeypatch.setattr(groups, "bank_of", lambda arguments: bank)
+    arguments = groups.GroupsArguments(draws=300, seeds=(0,), group_evidence=evidence)
+    assert cells(groups.groups(arguments))[1][1] == n_groups
 
 
 def test_the_shipped_tasks_form_six_pure_groups_in_every_schedule():
