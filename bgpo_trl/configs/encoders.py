@@ -51,7 +51,7 @@ class VAEConfig(FitConfig):
     """Factor of the squared error summed over a frame. Ours: the unit of the other weights."""
     foreground_weight: float = 20.0
     """Further weight of a pixel's error, times its difference to the mean training frame (black and
-    white differ by 1). Ours: without it, small objects are found last (docs/learning.md)."""
+    white differ by 1). Ours: small objects are seen better with it (docs/learning.md)."""
     kl_weight: float = 0.01
     """Factor of the KL divergence summed over dimensions. Ours: a larger one drops the objects,
     which are 5 pixels wide."""

@@ -93,10 +93,8 @@ def vae_inverse_loss(
     if known is None:
         known = torch.ones(pixels.shape[:-4], dtype=torch.bool, device=pixels.device)
     squared = (predicted - action[..., :-1, :]).square().sum(-1).mean(-1)
-    counted = error
-    if foreground_weight:
-        difference = (frames - vae.mean_frame).abs().amax(-1, keepdim=True)
-        counted = error * (1 + foreground_weight * difference)
+    difference = (frames - vae.mean_frame).abs().amax(-1, keepdim=True)
+    counted = error * (1 + foreground_weight * difference)
     kl = (mu.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean() / 2
     inverse = (squared * known).sum() / known.sum().clamp_min(1) / 2
     terms = {

@@ -24,6 +24,7 @@ class HandVAE(nn.Module):
     def __init__(self, mu: Tensor, log_variance: Tensor, grey: float = 0.0) -> None:
         super().__init__()
         self.mu, self.log_variance, self.grey = mu, log_variance, grey
+        self.mean_frame = torch.zeros(32, 64, 3)
 
     def encode(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         return self.mu, self.log_variance
