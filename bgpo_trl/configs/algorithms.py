@@ -296,7 +296,8 @@ class BGPOConfig(AlgorithmConfig):
     with demonstrations have per task; without experts, the RL algorithm's ``batch_size`` is shared
     by all groups."""
     group_size: int = 10
-    """Least number of different demonstrations of a group of behaviors. Ours."""
+    """Bound on the least number of different demonstrations of a group: among few, fewer
+    form one (`least_size`). Ours."""
     group_evidence: float = 1.0
     """Depth of the valley of density between two groups, in multiples of what chance explains
     (`density_clusters`). Ours."""

@@ -13,7 +13,7 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from bgpo_trl.errors import as_shape
-from bgpo_trl.modules.density_clusters import density_clusters, local_whitening
+from bgpo_trl.modules.density_clusters import density_clusters, least_size, local_whitening
 from bgpo_trl.modules.group_trials import GroupTrials
 from bgpo_trl.modules.gwr import Numbers, as_tensor
 
@@ -58,12 +58,12 @@ class BehaviorGroups:
     apart may be the small ones.
 
     1. A demonstration that is shown again, or differs from an earlier one by no more than rounding
-       (a ten-thousandth of its length), adds nothing. With every ``smallest`` new ones (beyond
-       ``100 * smallest``: with every hundredth part more), all are clustered anew; until the first
-       time, all are of group 0.
+       (a ten-thousandth of its length), adds nothing. With as many new ones as a cluster needs
+       (`least_size`; beyond ``100 * smallest``: with every hundredth part more), all are clustered
+       anew; until the first time, all are of group 0.
     2. An input belongs to the group of the nearest clustered demonstration. Its novelty is the
-       distance to the group's ``k``-th nearest, ``k = smallest // 2``, divided by the 99 % quantile
-       of this distance among the group's own demonstrations.
+       distance to the group's ``k``-th nearest, divided by the 99 % quantile of this distance among
+       the group's own demonstrations; ``k`` is half as many as a cluster needs.
     3. Groups keep their number when they are clustered anew. Clusters and groups are matched in the
        order of the number of times that the demonstrations they have in common were shown. So, of a
        group that splits, the larger part keeps the number; of groups that merge, the result has
@@ -90,7 +90,7 @@ class BehaviorGroups:
 
     Args:
         n_features: Size d of an input.
-        smallest: Least number of different demonstrations of a group.
+        smallest: Bound on the least number of different demonstrations of a group (`least_size`).
         evidence: Depth of a significant valley, in multiples of what chance explains.
         seed: Seed of the trials.
 
@@ -147,7 +147,6 @@ class BehaviorGroups:
                 f"{smallest} and {evidence}"
             )
         self.smallest, self.evidence = int(smallest), float(evidence)
-        self._k = self.smallest // 2  # neighbors by which distances to a group are measured
         self.trials = GroupTrials(seed)
         self.points, self.starts = np.empty((0, self.n_features)), np.empty((0, 0), np.float32)
         self.member = np.empty(0, np.bool_)
@@ -159,6 +158,11 @@ class BehaviorGroups:
         self._metric = np.eye(self.n_features)
         # By group, the 99 % quantile of its members' distances to their k-th neighbor in it.
         self._reach: dict[int, float] = {}
+
+    @property
+    def _k(self) -> int:
+        """Neighbors by which distances to a group are measured."""
+        return least_size(len(self.cluster), self.smallest) // 2
 
     @property
     def numbers(self) -> list[int]:
@@ -265,7 +269,7 @@ class BehaviorGroups:
         match = self.lookup(phi)
         is_new = self._show(self._checked(phi), first, int(match.group))
         n_clustered = len(self.cluster)
-        due = n_clustered + max(self.smallest, n_clustered // 100)
+        due = n_clustered + max(least_size(n_clustered, self.smallest), n_clustered // 100)
         if is_new and len(self.points) >= due:
             self._fit_metric(len(self.points))
             self.cluster = density_clusters(

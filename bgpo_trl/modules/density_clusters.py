@@ -12,6 +12,8 @@ from scipy.spatial.distance import pdist, squareform
 
 Points = NDArray[np.float64]
 
+# Of four or five points, an estimate from two neighbors: chance splits a fifth of what is one.
+_FEWEST = 6  # points of a cluster
 _LEAST_DEPTH = 0.5  # of a valley, seen from the sparser of its two sides
 
 
@@ -21,8 +23,8 @@ def density_clusters(
     """Cluster points by density; one cluster unless there is evidence of a valley.
 
     The hierarchy is that of HDBSCAN (Campello et al., 2013): single linkage of mutual reachability
-    distances, with the distance ``r`` to the ``k``-th neighbor, ``k = smallest // 2``, as the core
-    distance. From the bottom up, two branches of at least ``smallest`` points that meet at a
+    distances, with the distance ``r`` to the ``k``-th neighbor as the core distance; ``k`` is half
+    the `least_size` of a cluster. From the bottom up, two branches of this size that meet at a
     distance ``s`` are different clusters if the valley between them is significant
     (cf. Burman and Polonik, 2009, "Multivariate mode hunting"): the density at a point is
     proportional to ``r ** -m`` for data of `intrinsic_dimension` ``m``, and the logarithm of an
@@ -40,7 +42,7 @@ def density_clusters(
 
     Args:
         points: ``[n, d]``, all different.
-        smallest: Least number of points of a cluster.
+        smallest: Bound on the least number of points of a cluster; see `least_size`.
         evidence: Depth of a significant valley, in multiples of what chance explains.
 
     Returns:
@@ -56,7 +58,9 @@ def density_clusters(
         >>> np.bincount(density_clusters(points))
         array([20, 40])
     """
-    n_points, k = len(points), smallest // 2
+    n_points = len(points)
+    smallest = least_size(n_points, smallest)
+    k = smallest // 2
     labels = np.zeros(n_points, np.int64)
     if n_points < 2 * smallest:
         return labels
@@ -102,6 +106,21 @@ def density_clusters(
         for number, members in enumerate(sorted(found, key=min)):
             labels[members] = number
     return labels
+
+
+def least_size(n_points: int, most: int) -> int:
+    """Return the least number of points that are a cluster among ``n_points``.
+
+    It is ``log2(n_points)``, but at least 6 and at most ``most``. The number of neighbors that tell
+    clusters from noise grows with this logarithm (Brito et al., 1997, "Connectivity of the mutual
+    k-nearest-neighbor graph in clustering and outlier detection"). With a constant that suits many
+    points, a small cluster among few points would fall to the cluster next to it.
+
+    Examples:
+        >>> [least_size(n, most=10) for n in (30, 90, 300, 3_000)]
+        [6, 6, 8, 10]
+    """
+    return min(most, max(_FEWEST, int(np.log2(max(n_points, 1)))))
 
 
 def local_whitening(points: Points, *, k: int = 2) -> Points:

@@ -35,7 +35,7 @@ def test_inputs_are_unknown_and_of_group_0_before_the_first_clustering():
     assert match.group.equal(torch.zeros(3, 5, dtype=torch.int64))
     assert not match.known.any()
     assert groups.numbers == [0]
-    one, few = BehaviorGroups(4), around(0, 9)
+    one, few = BehaviorGroups(4), around(0, 5)
     show(one, few.repeat(10, 1))  # again and again adds nothing
     assert not one.lookup(few).known.any()
     show(one, around(0, 1, seed=1))
@@ -76,8 +76,8 @@ def test_novelty_is_relative_to_the_extent_of_the_group():
 def test_larger_part_of_a_split_group_keeps_the_number(sizes):
     inputs = torch.cat([around(place, size) for place, size in enumerate(sizes)])
     order = torch.randperm(120, generator=torch.Generator().manual_seed(0))
-    groups = BehaviorGroups(4, smallest=40)
-    assert set(show(groups, inputs[order])) == {0}  # until it splits with the last of them
+    groups = BehaviorGroups(4)
+    show(groups, inputs[order])
     assert groups.numbers == [0, 1]
     assert groups.parent[1] == 0
     larger = sizes.index(75)
@@ -227,7 +227,7 @@ def test_a_part_of_a_joined_group_parts_unless_the_groups_expert_solves_it(
     play(torch.cat([draw(60, halves=4.5), draw(40, place=40.0)]))
     assert groups.numbers == plain.numbers == [0, 1]
     groups.join(0, 1)
-    play(draw(60, halves=4.5))
+    play(draw(200, halves=4.5))
     assert len(plain.numbers) == 3
     assert len(groups.numbers) == n_groups
     restored = BehaviorGroups(1)
