@@ -124,7 +124,8 @@ class RecordArguments(ImportArguments):
     scene: str = "nico"
     """Robot, nico or one that the module of --import adds."""
     tasks: tuple[str, ...] | None = None
-    """Tasks to demonstrate; by default the usual ones of the scene, for NICO the paper's three."""
+    """Tasks to demonstrate, or "all" for all of the scene; by default its usual ones, for NICO the
+    paper's three."""
     per_task: int = 1_200
     """Demonstrations of each task."""
     held_out_per_task: int = 200

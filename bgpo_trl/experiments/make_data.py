@@ -18,6 +18,7 @@ from bgpo_trl.experiments.arguments import (
     ProbesArguments,
     RecordArguments,
 )
+from bgpo_trl.experiments.settings import chosen_tasks
 from bgpo_trl.machine import choose_device
 from bgpo_trl.runs.provenance import command
 from bgpo_trl.scenes import Scene, find_scene
@@ -26,6 +27,7 @@ from bgpo_trl.scenes import Scene, find_scene
 def record(arguments: RecordArguments) -> None:
     """Record demonstrations, or random play; see `record_demonstrations`."""
     options = {name: value for name, value in vars(arguments).items() if name != "module"}
+    options["tasks"] = chosen_tasks(arguments.tasks, find_scene(arguments.scene))
     record_demonstrations(**options)
 
 

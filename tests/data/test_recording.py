@@ -6,6 +6,8 @@ import torch
 from bgpo_trl.data import recording as demonstrations
 from bgpo_trl.data.dataset import load_demonstrations, open_dataset, read_meta
 from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.experiments.arguments import RecordArguments
+from bgpo_trl.experiments.make_data import record
 from suites import nico
 from tests.helpers import contents
 
@@ -152,3 +154,9 @@ def test_wrong_arguments_are_refused_before_anything_is_written(tmp_path, wrong,
         record_demonstrations(tmp_path / "new", **{**TINY, **wrong})
 
     assert not (tmp_path / "new").exists()
+
+
+def test_the_command_records_all_tasks_by_one_word(tmp_path):
+    record(RecordArguments(path=tmp_path, tasks=("all",), per_task=1, held_out_per_task=0))
+
+    assert read_meta(tmp_path)["tasks"] == list(nico.ALL_TASKS)
