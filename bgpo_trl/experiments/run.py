@@ -29,7 +29,7 @@ from bgpo_trl.experiments.settings import (
 from bgpo_trl.files.writing import lock_directory, write_json
 from bgpo_trl.machine import choose_device, keep_freed_memory, set_threads
 from bgpo_trl.runs.config_file import Digests, read_config, read_encoder_settings
-from bgpo_trl.runs.dashboard import tensorboard_logger, wandb_logger
+from bgpo_trl.runs.dashboard import check_installed, tensorboard_logger, wandb_logger
 from bgpo_trl.runs.demonstrations import load_inputs, own_weights
 from bgpo_trl.runs.directory import holds_run
 from bgpo_trl.runs.growth import Grown, add_task, distinctness
@@ -83,17 +83,19 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
         config = _continued(arguments, config, begun[0])
         if arguments.add_task is None and _is_finished(out, config, begun[0]):
             return f"{out} is finished, all {config.episodes} episodes: --episodes makes it longer"
+    loggers: list[Callable[[], Logger]] = []
+    if arguments.wandb is not None:
+        check_installed("wandb")
+        loggers.append(partial(wandb_logger, out, arguments.wandb, group))
+    if arguments.tensorboard:
+        check_installed("tensorboard")
+        loggers.append(partial(tensorboard_logger, out))
     if arguments.add_task is not None:
         grown = add_task(out, arguments.add_task, config=config, bank=arguments.bank)
         config, seen = grown.config, distinctness(grown.bank)
         verdict = f"{arguments.add_task}: {seen}"
         if not seen.clear:
             warnings.warn(verdict, stacklevel=2)
-    loggers: list[Callable[[], Logger]] = []
-    if arguments.wandb is not None:
-        loggers.append(partial(wandb_logger, out, arguments.wandb, group))
-    if arguments.tensorboard:
-        loggers.append(partial(tensorboard_logger, out))
     with lock_directory(out):
         if grown is None:
             encoders, bank = _inputs(arguments, config, out, device, begun)

@@ -7,6 +7,7 @@ import os
 import uuid
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -131,47 +132,38 @@ def wandb_logger(
             a resumed run continues its curves.
         mode: ``"online"``, or ``"offline"`` for a later ``wandb sync``.
         group: Group of the run.
-
-    Raises:
-        ImportError: If wandb is not installed.
     """
     directory = Path(directory)
     identity = directory / "wandb" / "run_id"
     identity.parent.mkdir(parents=True, exist_ok=True)
     if not identity.exists():
         write_whole(identity, uuid.uuid4().hex)
-    try:
-        return WandbLogger(
-            directory.name,
-            project="bgpo_trl",
-            save_dir=str(directory),
-            id=identity.read_text(),
-            log_env_packages=False,  # would reveal paths of this machine
-            mode=mode,  # not `offline=`, which changes os.environ for good
-            group=group,
-            settings={
-                "init_timeout": 30,
-                "finish_timeout": 60,
-                "console": "off",  # would upload every redraw of the progress bar
-                "x_disable_meta": True,  # command, program and folders of this machine
-            },
-        )
-    except ImportError:
-        raise ImportError("wandb is not installed: pip install 'bgpo_trl[wandb]'") from None
+    return WandbLogger(
+        directory.name,
+        project="bgpo_trl",
+        save_dir=str(directory),
+        id=identity.read_text(),
+        log_env_packages=False,  # would reveal paths of this machine
+        mode=mode,  # not `offline=`, which changes os.environ for good
+        group=group,
+        settings={
+            "init_timeout": 30,
+            "finish_timeout": 60,
+            "console": "off",  # would upload every redraw of the progress bar
+            "x_disable_meta": True,  # command, program and folders of this machine
+        },
+    )
 
 
 def tensorboard_logger(directory: str | os.PathLike[str]) -> TensorboardLogger:
-    """Return a logger that writes to ``tensorboard/`` in a run directory.
+    """Return a logger that writes to ``tensorboard/`` in a run directory."""
+    return TensorboardLogger("tensorboard", log_dir=str(directory))
 
-    Raises:
-        ImportError: If tensorboard is not installed.
-    """
-    try:
-        return TensorboardLogger("tensorboard", log_dir=str(directory))
-    except ImportError:
-        raise ImportError(
-            "tensorboard is not installed: pip install 'bgpo_trl[tensorboard]'"
-        ) from None
+
+def check_installed(package: str) -> None:
+    """Raise ``ImportError`` if the package of a logger is missing."""
+    if find_spec(package) is None:
+        raise ImportError(f"{package} is not installed: pip install 'bgpo_trl[{package}]'")
 
 
 def _untested(directory: Path) -> list[Mapping[Any, Any]]:

@@ -204,6 +204,7 @@ def test_dashboards_get_evaluations_and_final_tests(tiniest, monkeypatch, tmp_pa
 
     monkeypatch.setattr(experiment, "wandb_logger", start)
     monkeypatch.setattr(experiment, "tensorboard_logger", start)
+    monkeypatch.setattr("bgpo_trl.runs.dashboard.find_spec", lambda package: package)
     arguments = Arguments(out=run, wandb="offline", tensorboard=True)
     continual(arguments)
     trained = read_table(run / "final.csv").query("demonstrations == 'held-out'")
@@ -225,6 +226,14 @@ def test_dashboards_get_evaluations_and_final_tests(tiniest, monkeypatch, tmp_pa
         with pytest.raises(ValueError, match="holds a run"):
             continual(replace(arguments, **again))
     assert len(started) == 3  # a run that is refused starts no logger
+
+
+@pytest.mark.parametrize(("package", "value"), [("wandb", "offline"), ("tensorboard", True)])
+def test_a_missing_dashboard_is_told_before_a_run_begins(package, value, monkeypatch, tmp_path):
+    monkeypatch.setattr("bgpo_trl.runs.dashboard.find_spec", lambda package: None)
+    with pytest.raises(ImportError, match=rf"pip install 'bgpo_trl\[{package}\]'"):
+        continual(Arguments(out=tmp_path / "run", **{package: value}))
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bgpo_trl.runs import dashboard
-from bgpo_trl.runs.dashboard import Dashboard, tensorboard_logger, wandb_logger
+from bgpo_trl.runs.dashboard import Dashboard, tensorboard_logger
 from bgpo_trl.runs.directory import RunLogger
 from bgpo_trl.runs.results import COLUMNS
 from tests.helpers import Recorder
@@ -144,19 +144,6 @@ def test_a_logger_that_fails_is_dropped_with_one_warning(make, method, monkeypat
             board.log_eval(evaluation(number))
     assert len(caught) == len(calls) == 1
     assert (len(intact.metrics), intact.closed) == (2, True)
-
-
-@pytest.mark.parametrize(
-    ("package", "make_logger"),
-    [("wandb", lambda run: wandb_logger(run, "offline")), ("tensorboard", tensorboard_logger)],
-)
-def test_a_missing_package_is_one_warning(package, make_logger, make, monkeypatch, tmp_path):
-    attribute = {"wandb": "_has_wandb", "tensorboard": "_has_tb"}[package]
-    monkeypatch.setattr(f"torchrl.record.loggers.{package}.{attribute}", False)
-    with pytest.warns(UserWarning, match=rf"pip install 'bgpo_trl\[{package}\]'") as caught:
-        board = make(lambda: make_logger(tmp_path))
-    assert len(caught) == 1
-    board.log_eval(evaluation(2))  # the run goes on without it
 
 
 def test_tensorboard_gets_the_means_as_scalars_in_the_run_directory(make, monkeypatch, tmp_path):
