@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+_LIKE_OWN = 0.75  # share of an expert's own success at which another group is like its own
 _Counts = dict[int, dict[int, list[int]]]  # successes and episodes, by group shown and expert
 
 
@@ -17,7 +18,8 @@ class GroupTrials:
 
     Args:
         seed: Seed of the selection.
-        successes: Least number of successes by which two groups are one task; see `same_task`.
+        successes: Of one expert after demonstrations of the other's group, by which two groups are
+            one task; see `same_task`.
 
     Attributes:
         after_own: Counts of episodes whose start fits the group shown.
@@ -25,7 +27,7 @@ class GroupTrials:
         n_trials: Number of the other episodes.
     """
 
-    def __init__(self, seed: int = 0, successes: int = 5) -> None:
+    def __init__(self, seed: int = 0, successes: int = 3) -> None:
         self.seed, self.successes = seed, successes
         self.after_own: _Counts = {}
         self.after_others: _Counts = {}
@@ -64,25 +66,21 @@ class GroupTrials:
     def same_task(self) -> tuple[int, int] | None:
         """Return two groups that are one task, or None.
 
-        Each one's expert has been tried ``successes`` times after demonstrations of the other, with
-        as many successes together. Neither way, they fall short, by more than a standard deviation,
-        of half the rate that the expert has after demonstrations of its own group.
+        Each one's expert has succeeded ``successes`` times after demonstrations of the other, at a
+        rate that falls short, by no more than a standard deviation, of three quarters of its rate
+        after demonstrations of its own group. With fewer successes, experts that seldom succeed
+        would be joined by chance.
         """
         for one, other in combinations(sorted(self.after_others), 2):
-            (won, n), (won_back, n_back) = (
-                self.after_others[shown].get(expert, (0, 0))
-                for shown, expert in ((one, other), (other, one))
-            )
-            tried = min(n, n_back, won + won_back) >= self.successes
-            if tried and self._pays(one, other) and self._pays(other, one):
+            if self._succeeds(one, other) and self._succeeds(other, one):
                 return one, other
         return None
 
-    def _pays(self, shown: int, expert: int) -> bool:
-        won, episodes = self.after_others[shown][expert]
+    def _succeeds(self, shown: int, expert: int) -> bool:
+        won, episodes = self.after_others[shown].get(expert, (0, 0))
         own, of = self.after_own.get(expert, {}).get(expert, (0, 1))
-        half = episodes * own / of / 2
-        return won >= half - half**0.5
+        expected = episodes * own / of * _LIKE_OWN
+        return won >= max(self.successes, expected - expected**0.5)
 
     def state_dict(self) -> dict[str, Any]:
         """Return what is counted."""

@@ -35,7 +35,7 @@ def test_inputs_are_unknown_and_of_group_0_before_the_first_clustering():
     assert match.group.equal(torch.zeros(3, 5, dtype=torch.int64))
     assert not match.known.any()
     assert groups.numbers == [0]
-    one, few = BehaviorGroups(4), around(0, 5)
+    one, few = BehaviorGroups(4), around(0, 9)
     show(one, few.repeat(10, 1))  # again and again adds nothing
     assert not one.lookup(few).known.any()
     show(one, around(0, 1, seed=1))
@@ -235,6 +235,30 @@ def test_a_part_of_a_joined_group_parts_unless_the_groups_expert_solves_it(
     for each in (groups, restored):
         show(each, draw(40, place=-40.0))  # of what nobody has solved
         assert len(each.numbers) == n_groups + 1
+
+
+@pytest.mark.parametrize("solved", [True, False])
+def test_a_small_cluster_is_a_group_once_an_expert_falls_short_there(solved):
+    """Of eight demonstrations, next to forty that the group's expert solves four times in five."""
+    many, few = around(0, 40), around(1, 8)
+    groups = BehaviorGroups(4)
+
+    def play(demonstrations, successes):
+        for phi, success in zip(demonstrations, successes, strict=True):
+            group = int(groups.adapt(phi).group)
+            groups.end(group, group, fits=True, success=success)
+
+    show(groups, torch.cat([many, few, around(0, 2, seed=1)]))
+    assert groups.numbers == [0]
+    play(many, [number % 5 > 0 for number in range(40)])
+    play(few[:2], [solved] * 2)
+    assert groups.numbers == [0]  # half of .8 times 2 is less than a deviation above 0
+    play(few[2:], [solved] * 6)
+    assert groups.numbers == ([0] if solved else [0, 1])
+    assert group_of(groups, around(1, 20, seed=2)) == [0 if solved else 1]
+    assert group_of(groups, around(0, 20, seed=2)) == [0]
+    show(groups, around(0, 20, seed=3))  # clustered anew, it stays
+    assert groups.numbers == ([0] if solved else [0, 1])
 
 
 # ---- the shipped banks
