@@ -296,8 +296,7 @@ class BGPOConfig(AlgorithmConfig):
     with demonstrations have per task; without experts, the RL algorithm's ``batch_size`` is shared
     by all groups."""
     group_size: int = 10
-    """Least number of different demonstrations of a group, unless an expert falls short on fewer
-    (`BehaviorGroups`). Ours."""
+    """Least number of different demonstrations of a group among few; see `least_size`. Ours."""
     group_evidence: float = 1.0
     """Depth of the valley of density between two groups, in multiples of what chance explains
     (`density_clusters`). Ours."""

@@ -75,25 +75,22 @@ class BehaviorGroups:
        demonstrations, and does not fall short, by more than a standard deviation, of half its rate
        after the others. The first demonstrations of a new task may be of this group too, but its
        expert does not solve them.
-    5. A cluster of fewer than ``smallest`` is a group only if the expert that plays after its
-       demonstrations falls short there, in the same measure. Until then, its demonstrations belong
-       to the groups next to them: an expert of so few would do worse.
 
     A task that looks different from different starts, such as a push to the left or to the right,
     forms several groups. The expert of each does not know what to do where the group's own
     demonstrations never began. Where the starts of demonstrations are given, too,
 
-    6. a start *fits* a group if its distance to the nearest start of the group's demonstrations is
+    5. a start *fits* a group if its distance to the nearest start of the group's demonstrations is
        at most the 90 % quantile of this distance among those starts themselves;
-    7. where a start does not fit the group shown, the episode is played by the expert of that group
+    6. where a start does not fit the group shown, the episode is played by the expert of that group
        or of one that it fits, whichever `GroupTrials.select` draws (`expert`);
-    8. two groups whose experts succeed after each other's demonstrations are joined (`end`).
+    7. two groups whose experts succeed after each other's demonstrations are joined (`end`).
 
     Each seed has groups of its own.
 
     Args:
         n_features: Size d of an input.
-        smallest: Least number of different demonstrations of a group, unless an expert fails (5).
+        smallest: Least number of different demonstrations of a group among few (`least_size`).
         evidence: Depth of a significant valley, in multiples of what chance explains.
         seed: Seed of the trials.
 
@@ -241,8 +238,6 @@ class BehaviorGroups:
             self.won[self._latest] += success
         if (pair := self.trials.same_task()) is not None:
             self.join(*pair)
-        elif self._in_small_cluster(self._latest) and self._linked()[self._latest] >= 0:
-            self._arrange()
 
     def adapt(self, phi: Numbers, start: Numbers | None = None) -> GroupMatch:
         """Find the group of one demonstration and learn from it.
@@ -418,31 +413,15 @@ class BehaviorGroups:
                 of_part = np.flatnonzero(labels == part)
                 known = of_part[group[of_part] == number]
                 others = np.flatnonzero(labels == largest)
-                solved = self.won[known].sum() >= _SOLVED and not self._falls_short(known, others)
-                if 2 * len(known) > len(of_part) and solved:
+                if 2 * len(known) > len(of_part) and self._solves(known, others):
                     labels[of_part] = largest
-        for part in np.unique(labels[labels >= 0]).tolist():
-            of_part = np.flatnonzero(labels == part)
-            if len(of_part) < self.smallest and not self._is_own(of_part, labels):
-                labels[of_part] = -1
         return labels
 
-    def _in_small_cluster(self, row: int) -> bool:
-        """Return whether a demonstration is in a cluster that is no group."""
-        return not self.member[row] and row < len(self.cluster) and self.cluster[row] >= 0
-
-    def _is_own(self, part: NDArray[np.int64], labels: NDArray[np.int64]) -> bool:
-        """Return whether a small cluster is a group: it has been one, or an expert fails there."""
-        number = np.bincount(self.group[part]).argmax()
-        in_group = self.group[: len(labels)] == number
-        others = np.flatnonzero(in_group & (labels >= 0) & (labels != labels[part[0]]))
-        return not len(others) or self._falls_short(part, others)
-
-    def _falls_short(self, part: NDArray[np.int64], others: NDArray[np.int64]) -> bool:
-        """Return whether a group's expert solves a part of its demonstrations less than others."""
+    def _solves(self, part: NDArray[np.int64], others: NDArray[np.int64]) -> bool:
+        """Return whether a group's expert solves a part of its demonstrations like others."""
         rate = self.won[others].sum() / max(1, self.tried[others].sum())
-        half = self.tried[part].sum() * rate / 2
-        return bool(self.won[part].sum() < half - half**0.5)
+        won, half = self.won[part].sum(), self.tried[part].sum() * rate / 2
+        return bool(won >= max(_SOLVED, half - half**0.5))
 
     def _measure(self) -> None:
         """Measure the reach of each group."""

@@ -42,7 +42,7 @@ def density_clusters(
 
     Args:
         points: ``[n, d]``, all different.
-        smallest: Bound on the least number of points of a cluster; see `least_size`.
+        smallest: Least number of points of a cluster among few; see `least_size`.
         evidence: Depth of a significant valley, in multiples of what chance explains.
 
     Returns:
@@ -111,16 +111,20 @@ def density_clusters(
 def least_size(n_points: int, most: int) -> int:
     """Return the least number of points that are a cluster among ``n_points``.
 
-    It is ``log2(n_points)``, but at least 6 and at most ``most``. The number of neighbors that tell
-    clusters from noise grows with this logarithm (Brito et al., 1997, "Connectivity of the mutual
-    k-nearest-neighbor graph in clustering and outlier detection"). With a constant that suits many
-    points, a small cluster among few points would fall to the cluster next to it.
+    It is ``most`` among fewer than ``4 * most`` points, where smaller clusters would be the halves
+    of one behavior as often as two. Beyond, it is ``log2(n_points)``, but at least 6 and at most
+    ``most``: the number of neighbors that tell clusters from noise grows with this logarithm (Brito
+    et al., 1997, "Connectivity of the mutual k-nearest-neighbor graph in clustering and outlier
+    detection"). With a constant that suits many points, a small cluster would fall to the cluster
+    next to it.
 
     Examples:
         >>> [least_size(n, most=10) for n in (30, 90, 300, 3_000)]
-        [6, 6, 8, 10]
+        [10, 6, 8, 10]
     """
-    return min(most, max(_FEWEST, int(np.log2(max(n_points, 1)))))
+    if n_points < 4 * most:
+        return most
+    return min(most, max(_FEWEST, int(np.log2(n_points))))
 
 
 def local_whitening(points: Points, *, k: int = 2) -> Points:

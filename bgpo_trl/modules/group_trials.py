@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-_LIKE_OWN = 0.75  # share of an expert's own success at which another group is like its own
 _Counts = dict[int, dict[int, list[int]]]  # successes and episodes, by group shown and expert
 
 
@@ -67,8 +66,8 @@ class GroupTrials:
         """Return two groups that are one task, or None.
 
         Each one's expert has succeeded ``successes`` times after demonstrations of the other, at a
-        rate that falls short, by no more than a standard deviation, of three quarters of its rate
-        after demonstrations of its own group. With fewer successes, experts that seldom succeed
+        rate that falls short, by no more than a standard deviation, of half its rate after
+        demonstrations of its own group. With fewer successes, experts that seldom succeed
         would be joined by chance.
         """
         for one, other in combinations(sorted(self.after_others), 2):
@@ -79,8 +78,8 @@ class GroupTrials:
     def _succeeds(self, shown: int, expert: int) -> bool:
         won, episodes = self.after_others[shown].get(expert, (0, 0))
         own, of = self.after_own.get(expert, {}).get(expert, (0, 1))
-        expected = episodes * own / of * _LIKE_OWN
-        return won >= max(self.successes, expected - expected**0.5)
+        half = episodes * own / of / 2
+        return won >= max(self.successes, half - half**0.5)
 
     def state_dict(self) -> dict[str, Any]:
         """Return what is counted."""

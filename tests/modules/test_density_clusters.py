@@ -91,12 +91,13 @@ def test_cluster_needs_the_least_number_of_points_and_the_evidence():
 
 
 def test_fewer_points_make_a_cluster_among_few():
-    assert [least_size(n, 10) for n in (1, 63, 127, 128, 511, 512, 1_024, 10**6)] == [
-        *(6, 6, 6, 7, 8, 9, 10, 10)
+    assert [least_size(n, 10) for n in (1, 39, 40, 127, 128, 511, 512, 1_024, 10**6)] == [
+        *(10, 10, 6, 6, 7, 8, 9, 10, 10)
     ]
     assert least_size(10**6, 5) == 5
-    points, labels = blobs([9, 9, 9])
+    points, labels = blobs([9] * 5)
     np.testing.assert_array_equal(density_clusters(points), labels)
+    assert density_clusters(points[:36]).max() < 1  # four clusters, each of less than ten
 
 
 def test_far_points_are_outliers_only_beside_several_clusters():

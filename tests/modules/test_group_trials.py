@@ -99,9 +99,9 @@ def test_the_seed_determines_the_choices():
         ((5, 10), (5, 10), True),
         ((3, 3), (3, 3), True),
         ((3, 3), (2, 3), False),  # two successes one way
-        ((8, 10), (3, 12), True),  # 3/4 of 50 % of 12 are 4.5; less a deviation of 2.12, 2.38
-        ((8, 10), (3, 15), False),  # 3/4 of 50 % of 15 are 5.63; less a deviation of 2.37, 3.25
-        ((3, 15), (8, 10), False),
+        ((8, 10), (3, 20), True),  # half of 50 % of 20 are 5; less a deviation of 2.24, 2.76
+        ((8, 10), (3, 22), False),  # half of 50 % of 22 are 5.5; less a deviation of 2.35, 3.15
+        ((3, 22), (8, 10), False),
     ],
 )
 def test_two_groups_are_one_task_if_each_pays_after_the_demonstrations_of_the_other(
