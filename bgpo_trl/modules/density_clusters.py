@@ -12,8 +12,6 @@ from scipy.spatial.distance import pdist, squareform
 
 Points = NDArray[np.float64]
 
-# Of four or five points, an estimate from two neighbors: chance splits a fifth of what is one.
-_FEWEST = 6  # points of a cluster
 _LEAST_DEPTH = 0.5  # of a valley, seen from the sparser of its two sides
 
 
@@ -112,7 +110,7 @@ def least_size(n_points: int, most: int) -> int:
     """Return the least number of points that are a cluster among ``n_points``.
 
     It is ``most`` among fewer than ``4 * most`` points, where smaller clusters would be the halves
-    of one behavior as often as two. Beyond, it is ``log2(n_points)``, but at least 6 and at most
+    of one behavior as often as two. Beyond, it is ``1 + log2(n_points)`` and at most
     ``most``: the number of neighbors that tell clusters from noise grows with this logarithm (Brito
     et al., 1997, "Connectivity of the mutual k-nearest-neighbor graph in clustering and outlier
     detection"). With a constant that suits many points, a small cluster would fall to the cluster
@@ -120,11 +118,11 @@ def least_size(n_points: int, most: int) -> int:
 
     Examples:
         >>> [least_size(n, most=10) for n in (30, 90, 300, 3_000)]
-        [10, 6, 8, 10]
+        [10, 7, 9, 10]
     """
     if n_points < 4 * most:
         return most
-    return min(most, max(_FEWEST, int(np.log2(n_points))))
+    return min(most, 1 + int(np.log2(n_points)))
 
 
 def local_whitening(points: Points, *, k: int = 2) -> Points:

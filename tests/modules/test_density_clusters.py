@@ -84,14 +84,14 @@ def test_a_sparse_cluster_is_told_from_a_dense_one_beside_it():
 def test_cluster_needs_the_least_number_of_points_and_the_evidence():
     points, _ = blobs([600, 14])
     assert density_clusters(points, evidence=2.0).max() == 1
-    few = points[:-6]  # eight points of the second, where nine are a cluster
+    few = points[:-5]  # nine points of the second, where ten are a cluster
     assert not density_clusters(few, evidence=2.0).any()
     assert density_clusters(few, smallest=6, evidence=2.0).max() == 1
     assert not density_clusters(points, evidence=50.0).any()
 
 
 def test_fewer_points_make_a_cluster_among_few():
-    assert [least_size(n, 10) for n in (1, 39, 40, 127, 128, 511, 512, 1_024, 10**6)] == [
+    assert [least_size(n, 10) for n in (1, 39, 40, 63, 64, 255, 256, 512, 10**6)] == [
         *(10, 10, 6, 6, 7, 8, 9, 10, 10)
     ]
     assert least_size(10**6, 5) == 5
