@@ -46,7 +46,7 @@ def test_the_command_names_the_tasks_that_share_a_group(monkeypatch):
     assert last.startswith("task0 and task1 share a group in 4 of 4: show more demonstrations")
 
 
-@pytest.mark.parametrize(("evidence", "n_groups"), [(1.0, "2"), (0.5, "3")])
+@pytest.mark.parametrize(("evidence", "n_groups"), [(1.0, "2"), (0.6, "3")])
 def test_less_evidence_parts_tasks_that_are_close(evidence, n_groups, monkeypatch):
     bank = places((0.0, 0.0), (0.2, 0.0), (9.0, 0.0))
     monkeypatch.setattr(groups, "bank_of", lambda arguments: bank)
