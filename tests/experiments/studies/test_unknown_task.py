@@ -46,11 +46,10 @@ def test_detections_are_counted_by_network():
 
 def test_only_a_task_with_other_embeddings_is_detected():
     apart = places((0.0, 0.0), (3.0, 0.0), (0.0, 3.0))
-    found = leave_one_out(apart, 2, seeds=[0, 1], draws=100)
-    assert found.known.shape == (2, 20) and found.unknown.shape == (2, 10)
-    assert found.area.tolist() == [1.0, 1.0]
-    assert found.detected.tolist() == [1.0, 1.0]
-    assert (found.false_alarms <= 1 / 20).all()  # one in a hundred lies farther out
+    found = leave_one_out(apart, 2, seeds=range(10), draws=100)
+    assert found.known.shape == (10, 20) and found.unknown.shape == (10, 10)
+    assert (found.area == 1).all() and (found.detected == 1).all()
+    assert found.false_alarms.mean() < 0.03  # by definition, some 1 % of what is known
     same = places((0.0, 0.0), (3.0, 0.0), (3.0, 0.0))
     found = leave_one_out(same, 2, seeds=[0], draws=100)
     assert 0.2 < found.area.item() < 0.8 and found.detected.item() == 0.0
