@@ -36,9 +36,9 @@ MODULE, SCENE = "examples.continual_world", "cw10"
 HELD_OUT = 10  # further demonstrations of each task, which test episodes show
 # Demonstrations come with their actions: no inverse model has to infer them.
 WITHOUT_INVERSE = InverseModelConfig(steps=0)
-ENCODERS = RepresentationConfig(inverse=WITHOUT_INVERSE)
+ENCODERS = RepresentationConfig(vae=VAEConfig(bfloat16=True), inverse=WITHOUT_INVERSE)
 SMALL_ENCODERS = RepresentationConfig(
-    vae=VAEConfig(steps=400),
+    vae=VAEConfig(steps=400, bfloat16=True),
     lae=SequenceAutoencoderConfig(steps=400, batch_size=64),
     inverse=WITHOUT_INVERSE,
 )
@@ -122,7 +122,7 @@ def main(
             "seeds": seeds,
             "schedule": "sequential",
             "task_starts": tuple(range(0, episodes * len(tasks), episodes)),
-            "eval_every": max(1, episodes // 5),
+            "eval_every": max(1, episodes // 2),
             "eval_episodes": 2 if small else 10,
         }
         print(run_experiment(arguments, "cw10", run_config(arguments, changes=changes)))
