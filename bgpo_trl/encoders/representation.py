@@ -234,31 +234,24 @@ def _tensors(representation: Representation) -> dict[str, Tensor]:
 def split(
     dataset: TensorDictBase, name: str = "the dataset"
 ) -> tuple[TensorDictBase, TensorDictBase]:
-    """Return the training and the held-out episodes, by the key ``train``; ``name`` is for errors.
-
-    Raises:
-        ValueError: If either set is empty.
-    """
-    chosen = dataset.get("train").bool()
-    if chosen.all():
-        raise ValueError(
-            f"{name} has no held-out episodes (key 'train'): record or write it with "
-            "held_out_per_task of at least 1"
-        )
-    return training_part(dataset, name), dataset[~chosen]  # pyright: ignore[reportReturnType]
+    """Return the training and the held-out episodes, see `part`."""
+    held_out = part(dataset, name, held_out=True)
+    return part(dataset, name), held_out
 
 
-def training_part(dataset: TensorDictBase, name: str) -> TensorDictBase:
-    """Return the training episodes, by the key ``train``; ``name`` is for errors.
+def part(dataset: TensorDictBase, name: str, *, held_out: bool = False) -> TensorDictBase:
+    """Return the training or the held-out episodes, by the key ``train``; ``name`` is for errors.
 
     Raises:
         ValueError: If there are none.
     """
-    chosen = dataset.get("train").bool()
+    chosen = dataset.get("train").bool() != held_out
     if not chosen.any():
+        lacking = "held-out episodes" if held_out else "episodes to train on"
+        bound = "of at least 1" if held_out else "below the number of episodes of each task"
         raise ValueError(
-            f"{name} has no episodes to train on (key 'train'): record or write it with a "
-            "held_out_per_task below the number of episodes of each task"
+            f"{name} has no {lacking} (key 'train'): record or write it with a held_out_per_task "
+            f"{bound}"
         )
     return dataset[chosen]  # pyright: ignore[reportReturnType]
 
