@@ -214,7 +214,6 @@ def write_demonstrations(
     *,
     scene: Scene | str,
     held_out_per_task: int,
-    tasks: Sequence[str] | None = None,
     spread: float = 1.0,
 ) -> TensorDict:
     """Write demonstrations as a dataset that trains encoders and makes banks.
@@ -233,10 +232,9 @@ def write_demonstrations(
 
     Args:
         path: Folder of the dataset, which must not exist.
-        episodes: Episodes by the name of their task, as many of each as there are.
+        episodes: Episodes by the name of their task, in the order of the labels.
         scene: The robot, or its name.
         held_out_per_task: How many of each task are held out for test episodes: the last ones.
-        tasks: Tasks to write, in the order of their labels; by default all of ``episodes``.
         spread: Share of the whole range of start states that the demonstrations cover.
 
     Returns:
@@ -257,11 +255,9 @@ def write_demonstrations(
     """
     scene = find_scene(scene)
     scene.check_spread(spread)
-    chosen = list(episodes) if tasks is None else list(tasks)
-    scene.check_tasks(chosen)
     # NumPy's integers cannot be written as JSON.
     settings = {"held_out_per_task": index(held_out_per_task), "spread": float(spread)}
-    return _write(Path(path), scene, {task: episodes.get(task, ()) for task in chosen}, settings)
+    return _write(Path(path), scene, episodes, settings)
 
 
 def write_logged_episodes(path: str | Path, episodes: Episodes, *, scene: Scene | str) -> None:
@@ -284,30 +280,29 @@ def write_logged_episodes(path: str | Path, episodes: Episodes, *, scene: Scene 
         >>> path = getfixture("tmp_path") / "log"
         >>> write_logged_episodes(path, {"grasp_glass": [failed]}, scene="nico")
     """
-    scene = find_scene(scene)
-    scene.check_tasks([*episodes])
     settings = {"held_out_per_task": 0, "spread": 1.0, "logged": True}
-    _write(Path(path), scene, episodes, settings)
+    _write(Path(path), find_scene(scene), episodes, settings)
 
 
 def _write(path: Path, scene: Scene, episodes: Episodes, settings: Mapping[str, Any]) -> TensorDict:
     """Check and write episodes, in the order of their tasks."""
-    tasks, held_out_per_task = [*episodes], settings["held_out_per_task"]
+    scene.check_tasks([*episodes])
+    held_out_per_task = settings["held_out_per_task"]
     _check_counts(episodes, held_out_per_task)
     keys, lengths = _check_episodes(scene, episodes, logged="logged" in settings)
     meta = {
         **layout_of(scene, keys, max(lengths) - 1),
-        "tasks": tasks,
+        "tasks": [*episodes],
         "rows": len(lengths),
         **settings,
     }
     with new_folder(path) as folder:
         dataset = make_dataset(folder, meta)
         row = 0
-        for task, name in enumerate(tasks):
-            n_shown = len(episodes[name]) - held_out_per_task
-            for number in range(len(episodes[name])):
-                for key, values in episodes[name][number].items():
+        for task, some in enumerate(episodes.values()):
+            n_shown = len(some) - held_out_per_task
+            for number in range(len(some)):
+                for key, values in some[number].items():
                     if key == "success":
                         dataset[key][row] = bool(values)
                         continue
@@ -365,11 +360,11 @@ def _check_episodes(
     """Return the keys of all episodes and the number of frames of each; warn of doubtful ones."""
     keys: set[str] | None = None
     lengths, known, doubtful = [], set[bytes](), dict[str, list[str]]()
-    for name in episodes:
-        if isinstance(episodes[name], Mapping):
+    for name, some in episodes.items():
+        if isinstance(some, Mapping):
             raise ValueError(f"{name!r} has one mapping: give a list of episodes, a mapping each")
-        for number in range(len(episodes[name])):
-            episode = episodes[name][number]
+        for number in range(len(some)):
+            episode = some[number]
             try:
                 _check_keys(episode, keys, logged)
                 lengths.append(_check_episode(scene, episode))

@@ -221,8 +221,8 @@ class GroupReplay:
                 if len(held):
                     steps[seed, place, : len(held)] = held
                     weight[seed, place, : len(held)] = n_rows / len(held)
-            steps[seed] = steps[seed] % self.capacity * len(self._generators) + seed
-        rows, counts = torch.from_numpy(steps).flatten(), torch.from_numpy(weight)
+        rows = self._rows_of(steps.reshape(len(steps), -1), range(len(steps)))
+        counts = torch.from_numpy(weight)
         drawn = TensorDict({"priority_weight": counts}, counts.shape)
         for key in [key for key in self._rows if key != _GROUP]:
             stored = self._rows[key]
