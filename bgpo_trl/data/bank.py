@@ -316,13 +316,10 @@ class DemonstrationBank:
         remedy = "make it again with `bgpo bank`, or use `--train-encoders`"
         try:
             tensors, meta = load_tensors(path)
-            tasks = json.loads(meta["tasks"])
-            if not isinstance(tasks, list) or not all(isinstance(name, str) for name in tasks):
-                raise ValueError("its tasks are no list of names")
             columns = {k.removeprefix("steps."): t for k, t in tensors.items() if "." in k}
             bank = cls(
                 **{key: tensor for key, tensor in tensors.items() if "." not in key},
-                tasks=tuple(tasks),
+                tasks=tuple(json.loads(meta["tasks"])),
                 steps=DemonstrationSteps(**columns) if columns else None,
                 encoder_id=encoder_id,
                 spread=float(meta["spread"]),

@@ -76,13 +76,7 @@ def open_complete(path: Path) -> tuple[TensorDict, dict[str, Any]]:
 
 
 def layout_of(scene: Scene, known: Collection[str], max_steps: int) -> dict[str, Any]:
-    """Return the settings that fix the sizes of a dataset of a scene.
-
-    Args:
-        scene: The robot.
-        known: Entries that are known, of ``action``, ``state`` and ``joints``.
-        max_steps: Length of the longest episode.
-    """
+    """Return the settings that fix the sizes of a dataset of a scene, given the known `NUMBERS`."""
     state = scene.state if "state" in known else None
     joints = scene.joints if "joints" in known else None
     return {

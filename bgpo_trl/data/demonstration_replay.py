@@ -127,15 +127,7 @@ class DemonstrationReplay:
     def draw_actions(
         self, group: Tensor, *, generator: Sequence[torch.Generator] | None = None
     ) -> dict[NestedKey, Tensor]:
-        """Draw latents, with noise, and actions to imitate, as `draw` does.
-
-        Args:
-            group: Group of each row, int64 ``[S, *R]``.
-            generator: Random generators of the seeds, in place of the replay's.
-
-        Returns:
-            By key: ``"latent"``, the constant entries, ``"action"``, ``"priority_weight"``.
-        """
+        """Draw latents, with noise, and actions to imitate: as `draw`, without ``"next"``."""
         sources = self._generators if generator is None else generator
         entries, _, frame, _ = self._draw_frames(group, sources)
         state = self._states(frame)

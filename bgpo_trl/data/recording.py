@@ -197,13 +197,8 @@ def perform(
 ) -> tuple[dict[str, np.ndarray], bool]:
     """Return an episode as for `write_demonstrations`, and whether it succeeded.
 
-    Args:
-        scene: The robot, with a demonstrator.
-        simulation: One of its simulations.
-        task: Name of the task.
-        start: Seed of the start.
-        noise: Seed of the demonstrator.
-        policy_of: Returns the policy that acts, given the demonstrator's.
+    ``start`` and ``noise`` are the seeds of simulation and demonstrator. ``policy_of`` returns the
+    policy that acts, given the demonstrator's.
 
     Raises:
         ValueError: If an action is not ``[A]`` in [-1, 1], or the simulation returns what

@@ -71,10 +71,7 @@ class Representation:
     def check_scene(self, scene: Scene, what: object, remedy: str) -> None:
         """Raise ``ValueError`` unless the encoders are of a scene, and of its frames' size.
 
-        Args:
-            scene: The robot.
-            what: Name of the encoders, such as their path, which begins the message.
-            remedy: What to do if they are of another version of the scene.
+        ``what`` and ``remedy`` are as for `Scene.check_identity`.
         """
         scene.check_identity(self.metadata.get("scene"), what, remedy)
         found, wanted = [*self.frame_network.frame_shape], [*scene.frame_shape]
@@ -188,7 +185,13 @@ def _of_tensors(tensors: Mapping[str, Tensor], metadata: dict[str, str]) -> Repr
     """Return encoders of the tensors and metadata of a file."""
     config = json.loads(metadata["config"])
     if "frame_network" in metadata:
-        network = _named_frame_network(metadata)
+        identity, shape = metadata["frame_network"], json.loads(metadata["frame_shape"])
+        network = initialized(0, make_frame_network, identity.partition(" ")[0], shape)
+        if network.identity != identity:
+            raise FrameNetworkError(
+                f"it is of the frame network {identity!r}, the imported module has "
+                f"{network.identity!r}: use the version of the module, or train new ones"
+            )
     else:
         network = VAE(
             config["vae"]["latent_size"],
@@ -209,18 +212,6 @@ def _of_tensors(tensors: Mapping[str, Tensor], metadata: dict[str, str]) -> Repr
             raise ValueError("weights are of other types than those of the networks")
         module.load_state_dict(found)
     return encoders
-
-
-def _named_frame_network(metadata: Mapping[str, str]) -> FrameNetwork:
-    """Return the frame network of one's own that metadata name, with other weights."""
-    identity, shape = metadata["frame_network"], json.loads(metadata["frame_shape"])
-    network = initialized(0, make_frame_network, identity.partition(" ")[0], shape)
-    if network.identity != identity:
-        raise FrameNetworkError(
-            f"it is of the frame network {identity!r}, the imported module has "
-            f"{network.identity!r}: use the version of the module, or train new ones"
-        )
-    return network
 
 
 def _tensors(representation: Representation) -> dict[str, Tensor]:

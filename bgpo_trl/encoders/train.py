@@ -176,22 +176,9 @@ def make_pretrained(
 ) -> tuple[Representation, DemonstrationBank]:
     """Record demonstrations and play, train both encoders, and embed the demonstrations.
 
-    Each interrupted stage is resumed.
-
-    Args:
-        weights: File to write the encoders to; the bank is written beside it.
-        dataset: Folder of the demonstrations, recorded if missing. Half as many episodes of play go
-            to the folder of the same name plus ``-play``.
-        folder: Folder for the training log, checkpoints and probes.
-        config: Hyperparameters of the encoders.
-        per_task: Demonstrations of each task.
-        held_out_per_task: How many of those are held out.
-        seed: Seed of the recording.
-        tasks: Names of the tasks; by default the scene's.
-        scene: The robot, or its name.
-        command: Command line, stored with the weights.
-        device: Device to train on.
-        **shared: ``spread`` and ``progress``, as for `record_demonstrations` and `train_encoders`.
+    Demonstrations are recorded into the folder ``dataset``, and half as many episodes of play into
+    the folder of the same name plus ``-play``; each interrupted stage is resumed. Other arguments
+    are as for `record_demonstrations` and `train_encoders`, ``shared`` those of both.
 
     Raises:
         ValueError: If the dataset is damaged or was recorded in another scene.
