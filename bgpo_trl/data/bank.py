@@ -259,16 +259,14 @@ class DemonstrationBank:
             )
         tasks = tuple(dict.fromkeys((*self.tasks, *other.tasks)))
         label = torch.tensor([tasks.index(name) for name in other.tasks])
-        return DemonstrationBank(
-            torch.cat([self.embedding, other.embedding]),
-            torch.cat([self.task, label[other.task]]),
-            torch.cat([self.train, other.train]),
-            tasks,
-            None if self.steps is None or other.steps is None else self.steps + other.steps,
-            self.encoder_id,
-            min(self.spread, other.spread),
-            self.scene,
-            self.noise,
+        return replace(
+            self,
+            embedding=torch.cat([self.embedding, other.embedding]),
+            task=torch.cat([self.task, label[other.task]]),
+            train=torch.cat([self.train, other.train]),
+            tasks=tasks,
+            steps=None if self.steps is None or other.steps is None else self.steps + other.steps,
+            spread=min(self.spread, other.spread),
         )
 
     def _select(self, rows: Tensor) -> DemonstrationBank:

@@ -92,7 +92,10 @@ def train_representation(
     _check_actions(train, own, config.inverse)
     fit = Fit(config, **how)
     network = _frame_network(seen, fit)
-    if config.frame_network != "vae":
+    named = {}
+    if network.identity != VAE.identity:
+        shape = json.dumps(network.frame_shape)
+        named = {"frame_network": network.identity, "frame_shape": shape}
         fit = replace(fit, taken=f"{network.identity} {digest(network.state_dict())}")
     latent = encode_frames(network, train)
     lae = _train_lae(latent, train.get("length"), fit)
@@ -105,10 +108,8 @@ def train_representation(
         "config": json.dumps(asdict(config)),
         "seed": str(config.seed),
         "command": command,
+        **named,
     }
-    if network.identity != VAE.identity:
-        shape = json.dumps(network.frame_shape)
-        metadata |= {"frame_network": network.identity, "frame_shape": shape}
     return Representation(network.cpu(), lae, inverse, metadata)
 
 
