@@ -142,8 +142,8 @@ class DemonstrationBank:
         noise: Standard deviation of the noise that states to imitate should get (`choose_noise`).
 
     Raises:
-        ValueError: If a label has no name, a name is given twice, or ``steps`` are of another
-            number of demonstrations.
+        ValueError: If shapes or dtypes do not match, an embedding is not finite, a label has no
+            name, or a name is given twice.
     """
 
     embedding: Tensor
@@ -157,20 +157,29 @@ class DemonstrationBank:
     noise: float = 0.2
 
     def __post_init__(self) -> None:
+        embedding, task, train = self.embedding, self.task, self.train
+        if not (
+            embedding.ndim == 2
+            and task.shape == train.shape == embedding.shape[:1]
+            and (embedding.dtype, task.dtype, train.dtype)
+            == (torch.float32, torch.int64, torch.bool)
+            and embedding.isfinite().all()
+        ):
+            raise ValueError("its embeddings, tasks or parts have wrong shapes, or NaN")
         for name in self.tasks:
             check_name(name)
         if len({*self.tasks}) < len(self.tasks):
             raise ValueError(f"a task is named twice in {', '.join(self.tasks)}: name each once")
-        unknown = self.task[(self.task < 0) | (self.task >= len(self.tasks))]
+        unknown = task[(task < 0) | (task >= len(self.tasks))]
         if len(unknown):
             raise ValueError(
                 f"a demonstration has task label {int(unknown[0])}, but tasks names only "
                 f"{len(self.tasks)}: {', '.join(self.tasks)}"
             )
         if self.steps is not None and len(self.steps.first) != len(self.embedding):
+            n_steps, n = len(self.steps.first), len(embedding)
             raise ValueError(
-                f"the bank has steps of {len(self.steps.first)} demonstrations, but embeddings of "
-                f"{len(self.embedding)}"
+                f"the bank has steps of {n_steps} demonstrations, but embeddings of {n}"
             )
 
     @property
@@ -250,16 +259,14 @@ class DemonstrationBank:
             )
         tasks = tuple(dict.fromkeys((*self.tasks, *other.tasks)))
         label = torch.tensor([tasks.index(name) for name in other.tasks])
-        return DemonstrationBank(
-            torch.cat([self.embedding, other.embedding]),
-            torch.cat([self.task, label[other.task]]),
-            torch.cat([self.train, other.train]),
-            tasks,
-            None if self.steps is None or other.steps is None else self.steps + other.steps,
-            self.encoder_id,
-            min(self.spread, other.spread),
-            self.scene,
-            self.noise,
+        return replace(
+            self,
+            embedding=torch.cat([self.embedding, other.embedding]),
+            task=torch.cat([self.task, label[other.task]]),
+            train=torch.cat([self.train, other.train]),
+            tasks=tasks,
+            steps=None if self.steps is None or other.steps is None else self.steps + other.steps,
+            spread=min(self.spread, other.spread),
         )
 
     def _select(self, rows: Tensor) -> DemonstrationBank:
@@ -307,13 +314,10 @@ class DemonstrationBank:
         remedy = "make it again with `bgpo bank`, or use `--train-encoders`"
         try:
             tensors, meta = load_tensors(path)
-            tasks = json.loads(meta["tasks"])
-            if not isinstance(tasks, list) or not all(isinstance(name, str) for name in tasks):
-                raise ValueError("its tasks are no list of names")
             columns = {k.removeprefix("steps."): t for k, t in tensors.items() if "." in k}
             bank = cls(
                 **{key: tensor for key, tensor in tensors.items() if "." not in key},
-                tasks=tuple(tasks),
+                tasks=tuple(json.loads(meta["tasks"])),
                 steps=DemonstrationSteps(**columns) if columns else None,
                 encoder_id=encoder_id,
                 spread=float(meta["spread"]),
@@ -324,15 +328,6 @@ class DemonstrationBank:
             raise ValueError(f"there is no demonstration bank at {path}; {remedy}") from None
         except (ValueError, TypeError, KeyError, RecursionError) as error:
             raise ValueError(f"{path} is damaged or not a bank ({error}); {remedy}") from None
-        embedding, task, train = bank.embedding, bank.task, bank.train
-        if not (
-            embedding.ndim == 2
-            and task.shape == train.shape == embedding.shape[:1]
-            and (embedding.dtype, task.dtype, train.dtype)
-            == (torch.float32, torch.int64, torch.bool)
-            and embedding.isfinite().all()
-        ):
-            raise ValueError(f"{path} is damaged (wrong shapes, or NaN); {remedy}")
         if meta.get("encoder_id") != encoder_id:
             raise ValueError(
                 f"{path} was embedded by the encoders {meta.get('encoder_id')}, not by "

@@ -6,7 +6,7 @@ import hashlib
 import json
 import shutil
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from operator import index
 from pathlib import Path
 from typing import Any
@@ -21,22 +21,21 @@ from bgpo_trl.errors import as_shape
 from bgpo_trl.files.writing import make_folder, new_folder, write_json
 from bgpo_trl.scenes import SCENES, Scene, find_scene
 
-_META = "dataset.json"
+META = "dataset.json"
+"""File with the settings of a recording and, once it is complete, its checksum."""
 _REMEDY = (
     "record it again with `bgpo record PATH` (a robot other than NICO: --scene), or write it again"
 )
 
 
-def load_demonstrations(path: str | Path, *, verify: bool = True) -> TensorDict:
+def load_demonstrations(path: str | Path) -> TensorDict:
     """Open a dataset of `record_demonstrations` or `write_demonstrations`, memory-mapped.
-
-    ``verify`` compares the checksum, which reads the whole dataset.
 
     Raises:
         ValueError: If it is missing, incomplete, damaged, of another version of its scene, or of
             logged episodes, which may have failed.
     """
-    dataset, meta = open_complete(Path(path), verify=verify)
+    dataset, meta = open_complete(Path(path))
     if meta.get("logged"):
         raise ValueError(
             f"{path} holds logged episodes, which may have failed and are no demonstrations: give "
@@ -45,21 +44,20 @@ def load_demonstrations(path: str | Path, *, verify: bool = True) -> TensorDict:
     return dataset
 
 
-def open_complete(path: Path, *, verify: bool = True) -> tuple[TensorDict, dict[str, Any]]:
+def open_complete(path: Path) -> tuple[TensorDict, dict[str, Any]]:
     """Open demonstrations or logged episodes, memory-mapped; return them and their settings.
 
     Raises:
         ValueError: If they are missing, incomplete, damaged or of another version of their scene.
     """
     meta = read_meta(path)
-    # The scene of demonstrations from elsewhere need not be known here.
-    scene = find_scene(meta["scene"]) if meta["scene"] in SCENES else None
-    if scene is not None and scene.full_version != meta["scene_version"]:
-        raise ValueError(
-            f"{path} was recorded in scene {meta['scene_version']!r}, this is "
-            f"{scene.full_version}; {_REMEDY}"
-        )
-    if scene is not None:
+    if meta["scene"] in SCENES:  # That of demonstrations from elsewhere need not be known here.
+        scene = find_scene(meta["scene"])
+        if scene.full_version != meta["scene_version"]:
+            raise ValueError(
+                f"{path} was recorded in scene {meta['scene_version']!r}, this is "
+                f"{scene.full_version}; {_REMEDY}"
+            )
         found, known = meta["frame_shape"], [*scene.frame_shape]
         n_actions = meta["action_size"] or scene.action_size
         if (found, n_actions) != (known, scene.action_size):
@@ -72,41 +70,23 @@ def open_complete(path: Path, *, verify: bool = True) -> tuple[TensorDict, dict[
             f"the recording at {path} is not complete; resume it with the same command"
         )
     dataset = open_dataset(path, meta)
-    if verify and checksum_of(dataset) != meta["checksum"]:
+    if checksum_of(dataset) != meta["checksum"]:
         raise ValueError(f"{path} is damaged (checksum differs); remove it and {_REMEDY}")
     return dataset, meta
 
 
-def is_dataset(path: Path) -> bool:
-    """Return whether a folder holds a recording, complete or not."""
-    return (path / _META).exists()
-
-
-def layout_of(
-    scene: Scene,
-    *,
-    max_steps: int | None = None,
-    actions: bool = True,
-    states: bool = True,
-    joints: bool = True,
-) -> dict[str, Any]:
-    """Return the settings that fix the sizes of a dataset of a scene.
-
-    Args:
-        scene: The robot.
-        max_steps: Length of the longest episode; by default the scene's.
-        actions: Whether the actions are known.
-        states: Whether the ground truth is known, if the scene has some.
-        joints: Whether the joints are known, if the scene has some.
-    """
+def layout_of(scene: Scene, known: Collection[str], max_steps: int) -> dict[str, Any]:
+    """Return the settings that fix the sizes of a dataset of a scene, given the known `NUMBERS`."""
+    state = scene.state if "state" in known else None
+    joints = scene.joints if "joints" in known else None
     return {
         "scene": scene.name,
         "scene_version": scene.full_version,
         "frame_shape": [*scene.frame_shape],
-        "max_steps": max_steps or scene.max_steps,
-        "action_size": scene.action_size if actions else 0,
-        "state_size": scene.state.size if states and scene.state is not None else 0,
-        **({"joint_size": scene.joints.size} if joints and scene.joints is not None else {}),
+        "max_steps": max_steps,
+        "action_size": scene.action_size if "action" in known else 0,
+        "state_size": 0 if state is None else state.size,
+        **({} if joints is None else {"joint_size": joints.size}),
     }
 
 
@@ -117,14 +97,14 @@ def make_dataset(path: Path, meta: Mapping[str, Any]) -> TensorDict:
         OSError: If there is not enough disk space.
     """
     make_folder(path)
-    dataset = _empty(meta)
-    size, free = sum(_size(v) for _, v in dataset.items()), shutil.disk_usage(path).free
+    columns = _empty(meta)
+    size, free = sum(v.nbytes for v in columns.values()), shutil.disk_usage(path).free
     if size > free:  # Writing to a memory map on a full disk would kill the process.
         raise OSError(
             f"the dataset takes {size / 1e9:.1f} GB, {path} has {free / 1e9:.1f} GB left: "
             "make room or choose another folder"
         )
-    return dataset.memmap_like(str(path))
+    return TensorDict(columns, [meta["rows"]]).memmap_like(str(path))
 
 
 def open_dataset(path: Path, meta: Mapping[str, Any]) -> TensorDict:
@@ -135,18 +115,14 @@ def open_dataset(path: Path, meta: Mapping[str, Any]) -> TensorDict:
     """
     # Not TensorDict.load_memmap, which trusts the dtypes and shapes of its meta.json; the checksum
     # does not cover that file.
-    expected, tensors = _empty(meta), {}
-    for key, value in expected.items():
+    columns = _empty(meta)
+    for key, value in columns.items():
         file = path / f"{key}.memmap"
-        if not file.exists() or file.stat().st_size != _size(value):
+        if not file.exists() or file.stat().st_size != value.nbytes:
             raise ValueError(f"{file} is missing or truncated; remove {path} and {_REMEDY}")
         kind = {"dtype": value.dtype, "shape": value.shape}
-        tensors[key] = MemoryMappedTensor.from_filename(file, **kind)
-    return TensorDict(tensors, expected.batch_size)
-
-
-def _size(values: Tensor) -> int:
-    return values.numel() * values.element_size()
+        columns[key] = MemoryMappedTensor.from_filename(file, **kind)
+    return TensorDict(columns, [meta["rows"]])
 
 
 def checksum_of(dataset: TensorDict) -> str:
@@ -158,11 +134,6 @@ def checksum_of(dataset: TensorDict) -> str:
     return digest.hexdigest()
 
 
-def write_meta(path: Path, meta: dict) -> None:
-    """Write the settings of a recording, and the checksum of a complete one, atomically."""
-    write_json(path / _META, meta)
-
-
 def read_meta(path: Path) -> dict:
     """Return the settings of a recording, with ``checksum`` if it is complete.
 
@@ -170,7 +141,7 @@ def read_meta(path: Path) -> dict:
         ValueError: If there is no recording, or its settings are damaged.
     """
     try:
-        meta = json.loads((path / _META).read_text())
+        meta = json.loads((path / META).read_text())
     except OSError:
         if not path.exists():
             raise ValueError(f"there is no dataset at {path}; {_REMEDY}") from None
@@ -178,52 +149,55 @@ def read_meta(path: Path) -> dict:
     except (ValueError, RecursionError):
         meta = None
     if not isinstance(meta, dict) or not _is_complete(meta):
-        raise ValueError(f"{path / _META} is damaged; remove {path} and {_REMEDY}")
+        raise ValueError(f"{path / META} is damaged; remove {path} and {_REMEDY}")
     return meta
 
 
 def _is_complete(meta: Mapping[str, Any]) -> bool:
     """Return whether settings name tasks and scene, and sizes that a dataset can have."""
-    sizes = ("max_steps", "action_size", "state_size")
+    shape = meta.get("frame_shape")
+    if not isinstance(shape, list) or len(shape) != 2:
+        return False
+    sizes = [
+        *((meta.get(key), 0, 2**20) for key in ("max_steps", "action_size", "state_size")),
+        *((side, 1, 2**13) for side in shape),
+        (meta.get("joint_size", 1), 1, 2**20),
+        (meta.get("rows"), 1, 2**31),
+    ]
     return (
         isinstance(meta.get("tasks"), list)
         and isinstance(meta.get("scene"), str)
         and isinstance(meta.get("scene_version"), str)
-        and isinstance(meta.get("frame_shape"), list)
-        and len(meta["frame_shape"]) == 2
-        and all(type(size) is int and 0 < size < 2**13 for size in meta["frame_shape"])
-        and all(type(size) is int and 0 <= size < 2**20 for size in map(meta.get, sizes))
-        and type(joints := meta.get("joint_size", 1)) is int
-        and 0 < joints < 2**20
-        and type(meta.get("rows")) is int  # not a bool
-        and 0 < meta["rows"] < 2**31
+        and all(type(size) is int and least <= size < end for size, least, end in sizes)
     )
 
 
-def _empty(meta: Mapping[str, Any]) -> TensorDict:
-    n, steps = meta["rows"], meta["max_steps"]
-    number = torch.zeros((), dtype=torch.int64)
-    columns = {
-        "pixels": torch.zeros((), dtype=torch.uint8).expand(n, steps + 1, *meta["frame_shape"], 3),
-        "length": number.expand(n),
-        "task": number.expand(n),
-        "train": torch.zeros((), dtype=torch.bool).expand(n),
-        "seed": number.expand(n),
+def _empty(meta: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Return zeros of the types and shapes of a dataset, without memory of their own."""
+    n, n_frames = meta["rows"], meta["max_steps"] + 1
+    shapes: dict[str, tuple[torch.dtype, list[int]]] = {
+        "pixels": (torch.uint8, [n_frames, *meta["frame_shape"], 3]),
+        "length": (torch.int64, []),
+        "task": (torch.int64, []),
+        "train": (torch.bool, []),
+        "seed": (torch.int64, []),
     }
     if meta["state_size"]:
-        columns["state"] = torch.zeros(()).expand(n, steps + 1, meta["state_size"])
+        shapes["state"] = (torch.float32, [n_frames, meta["state_size"]])
     if "joint_size" in meta:
-        columns["joints"] = torch.zeros(()).expand(n, steps + 1, meta["joint_size"])
+        shapes["joints"] = (torch.float32, [n_frames, meta["joint_size"]])
     if meta["action_size"]:
-        columns["action"] = torch.zeros(()).expand(n, steps, meta["action_size"])
+        shapes["action"] = (torch.float32, [n_frames - 1, meta["action_size"]])
     if meta.get("logged"):
-        columns["success"] = torch.zeros((), dtype=torch.bool).expand(n)
-    return TensorDict(columns, [n])
+        shapes["success"] = (torch.bool, [])
+    return {key: torch.zeros((), dtype=d).expand(n, *shape) for key, (d, shape) in shapes.items()}
 
 
 Episodes = Mapping[str, Sequence[Mapping[str, Any]]]
 """Episodes by the name of their task; for an episode's entries, see `write_demonstrations`."""
-_KEYS = ("pixels", "action", "state", "joints")
+NUMBERS = ("action", "state", "joints")
+"""Entries of an episode, beside its frames, that may be known."""
+_KEYS = ("pixels", *NUMBERS)
 _IDLE = 5  # steps; shorter ones may be part of a task
 _FAR = 20  # scales, by which degrees for radians are found
 
@@ -234,7 +208,6 @@ def write_demonstrations(
     *,
     scene: Scene | str,
     held_out_per_task: int,
-    tasks: Sequence[str] | None = None,
     spread: float = 1.0,
 ) -> TensorDict:
     """Write demonstrations as a dataset that trains encoders and makes banks.
@@ -253,10 +226,9 @@ def write_demonstrations(
 
     Args:
         path: Folder of the dataset, which must not exist.
-        episodes: Episodes by the name of their task, as many of each as there are.
+        episodes: Episodes by the name of their task, in the order of the labels.
         scene: The robot, or its name.
         held_out_per_task: How many of each task are held out for test episodes: the last ones.
-        tasks: Tasks to write, in the order of their labels; by default all of ``episodes``.
         spread: Share of the whole range of start states that the demonstrations cover.
 
     Returns:
@@ -277,11 +249,9 @@ def write_demonstrations(
     """
     scene = find_scene(scene)
     scene.check_spread(spread)
-    chosen = list(episodes) if tasks is None else list(tasks)
-    scene.check_tasks(chosen)
     # NumPy's integers cannot be written as JSON.
     settings = {"held_out_per_task": index(held_out_per_task), "spread": float(spread)}
-    return _write(Path(path), scene, {task: episodes.get(task, ()) for task in chosen}, settings)
+    return _write(Path(path), scene, episodes, settings)
 
 
 def write_logged_episodes(path: str | Path, episodes: Episodes, *, scene: Scene | str) -> None:
@@ -304,36 +274,29 @@ def write_logged_episodes(path: str | Path, episodes: Episodes, *, scene: Scene 
         >>> path = getfixture("tmp_path") / "log"
         >>> write_logged_episodes(path, {"grasp_glass": [failed]}, scene="nico")
     """
-    scene = find_scene(scene)
-    scene.check_tasks([*episodes])
     settings = {"held_out_per_task": 0, "spread": 1.0, "logged": True}
-    _write(Path(path), scene, episodes, settings)
+    _write(Path(path), find_scene(scene), episodes, settings)
 
 
 def _write(path: Path, scene: Scene, episodes: Episodes, settings: Mapping[str, Any]) -> TensorDict:
     """Check and write episodes, in the order of their tasks."""
-    tasks, held_out_per_task = [*episodes], settings["held_out_per_task"]
-    _check_counts(episodes, tasks, held_out_per_task)
+    scene.check_tasks([*episodes])
+    held_out_per_task = settings["held_out_per_task"]
+    _check_counts(episodes, held_out_per_task)
     keys, lengths = _check_episodes(scene, episodes, logged="logged" in settings)
     meta = {
-        **layout_of(
-            scene,
-            max_steps=max(lengths) - 1,
-            actions="action" in keys,
-            states="state" in keys,
-            joints="joints" in keys,
-        ),
-        "tasks": tasks,
+        **layout_of(scene, keys, max(lengths) - 1),
+        "tasks": [*episodes],
         "rows": len(lengths),
         **settings,
     }
     with new_folder(path) as folder:
         dataset = make_dataset(folder, meta)
         row = 0
-        for task, name in enumerate(tasks):
-            n_shown = len(episodes[name]) - held_out_per_task
-            for number in range(len(episodes[name])):
-                for key, values in episodes[name][number].items():
+        for task, some in enumerate(episodes.values()):
+            n_shown = len(some) - held_out_per_task
+            for number in range(len(some)):
+                for key, values in some[number].items():
                     if key == "success":
                         dataset[key][row] = bool(values)
                         continue
@@ -342,7 +305,7 @@ def _write(path: Path, scene: Scene, episodes: Episodes, settings: Mapping[str, 
                 dataset["train"][row] = number < n_shown
                 dataset["length"][row] = lengths[row]
                 row += 1
-        write_meta(folder, {**meta, "checksum": checksum_of(dataset)})
+        write_json(folder / META, {**meta, "checksum": checksum_of(dataset)})
     return dataset
 
 
@@ -370,18 +333,17 @@ def resize_frames(pixels: NDArray[np.uint8], frame_shape: Sequence[int]) -> NDAr
     return torch.cat(parts).to(torch.uint8).permute(0, 2, 3, 1).contiguous().numpy()
 
 
-def _check_counts(episodes: Episodes, tasks: Sequence[str], held_out_per_task: int) -> None:
-    if not tasks:
+def _check_counts(episodes: Episodes, held_out_per_task: int) -> None:
+    if not episodes:
         raise ValueError("there are no episodes: give some of at least one task")
     if held_out_per_task < 0:
         raise ValueError(f"held_out_per_task must be at least 0, got {held_out_per_task}")
-    for name in tasks:
-        n_episodes = len(episodes.get(name, ()))
-        if not n_episodes:
+    for name, some in episodes.items():
+        if not len(some):
             raise ValueError(f"there is no episode of {name!r}: add some, or leave the task out")
-        if n_episodes <= held_out_per_task:
+        if len(some) <= held_out_per_task:
             raise ValueError(
-                f"{name!r} has {n_episodes} episodes, too few to hold out {held_out_per_task}: "
+                f"{name!r} has {len(some)} episodes, too few to hold out {held_out_per_task}: "
                 "lower held_out_per_task, or add episodes"
             )
 
@@ -392,14 +354,14 @@ def _check_episodes(
     """Return the keys of all episodes and the number of frames of each; warn of doubtful ones."""
     keys: set[str] | None = None
     lengths, known, doubtful = [], set[bytes](), dict[str, list[str]]()
-    for name in episodes:
-        if isinstance(episodes[name], Mapping):
+    for name, some in episodes.items():
+        if isinstance(some, Mapping):
             raise ValueError(f"{name!r} has one mapping: give a list of episodes, a mapping each")
-        for number in range(len(episodes[name])):
-            episode = episodes[name][number]
+        for number in range(len(some)):
+            episode = some[number]
             try:
                 _check_keys(episode, keys, logged)
-                lengths.append(check_episode(scene, episode))
+                lengths.append(_check_episode(scene, episode))
             except ValueError as error:
                 raise ValueError(f"episode {number} of {name!r} {error}") from None
             keys = set(episode)
@@ -434,12 +396,8 @@ def _doubts(scene: Scene, episode: Mapping[str, Any], known: set[bytes]) -> Iter
             yield f"have joints farther than {_FAR} scales from their center: in another unit?"
 
 
-def check_episode(scene: Scene, episode: Mapping[str, Any]) -> int:
-    """Return the number of frames of an episode, checked as `write_demonstrations` says.
-
-    Raises:
-        ValueError: If an entry has another type, shape or range; the message begins with a verb.
-    """
+def _check_episode(scene: Scene, episode: Mapping[str, Any]) -> int:
+    """Return the number of frames of an episode, checked as `write_demonstrations` says."""
     pixels = np.asarray(episode["pixels"])
     _check_pixels(pixels, least=2)
     length, *size = pixels.shape[:3]
@@ -449,14 +407,12 @@ def check_episode(scene: Scene, episode: Mapping[str, Any]) -> int:
             f"has frames of {size[0]} x {size[1]} pixels, the scene {scene.name!r} of {height} x "
             f"{width}: resize them first, for example with resize_frames"
         )
-    if "state" in episode and scene.state is None:
-        raise ValueError(f"has a state, but the scene {scene.name!r} has no ground truth: omit it")
-    if "joints" in episode and scene.joints is None:
-        raise ValueError(f"has joints, but the scene {scene.name!r} has none: omit them")
     shapes = {"action": (length - 1, scene.action_size)}
     for key, columns in (("state", scene.state), ("joints", scene.joints)):
         if columns is not None:
             shapes[key] = (length, columns.size)
+        elif key in episode:
+            raise ValueError(f"has {key}, but the scene {scene.name!r} has none: omit them")
     for key in shapes.keys() & episode.keys():
         values, shape = np.asarray(episode[key]), shapes[key]
         if values.dtype.kind not in "fiu" or values.shape != shape:

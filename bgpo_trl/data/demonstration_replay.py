@@ -12,6 +12,8 @@ from torch import Tensor
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.replay import GroupReplay, draw_for_rows
 
+_CAPACITY = 100_000  # demonstrations kept for each seed; the oldest are overwritten
+
 
 class DemonstrationReplay:
     """Transitions of the demonstrations shown to each seed, sampled by group.
@@ -31,7 +33,6 @@ class DemonstrationReplay:
             demonstration, or else with those of any one of its group.
         n_steps: Largest number of steps of a drawn transition, as in `GroupReplay`.
         gamma: Discount of the reward of a transition of several steps.
-        capacity: Demonstrations kept for each seed; the oldest are overwritten.
 
     Raises:
         ValueError: If the bank lacks the steps of a demonstration.
@@ -48,7 +49,6 @@ class DemonstrationReplay:
         own_constants: bool = True,
         n_steps: int = 1,
         gamma: float = 1.0,
-        capacity: int = 100_000,
     ) -> None:
         if bank.steps is None:
             raise ValueError(
@@ -56,8 +56,9 @@ class DemonstrationReplay:
                 "bgpo-experts, or make the bank again by encoders that were trained with actions "
                 "(docs/extending.md, Your demonstrations)"
             )
-        if (bank.steps.length < 2).any():
-            row = int((bank.steps.length < 2).nonzero()[0])
+        short = (bank.steps.length < 2).nonzero()
+        if len(short):
+            row = int(short[0])
             raise ValueError(
                 f"the bank has no steps of demonstration {row} to learn from: make it again with "
                 "`bgpo bank`, or choose --algorithm bgpo-experts"
@@ -70,7 +71,7 @@ class DemonstrationReplay:
         self._own_constants = own_constants
         self._constant_keys = list(constant_keys)
         self._shown = GroupReplay(
-            capacity,
+            _CAPACITY,
             generator=generator,
             keys=["demo_index", "reward", *constant_keys],
             source_key="demo_index",
@@ -126,15 +127,7 @@ class DemonstrationReplay:
     def draw_actions(
         self, group: Tensor, *, generator: Sequence[torch.Generator] | None = None
     ) -> dict[NestedKey, Tensor]:
-        """Draw latents, with noise, and actions to imitate, as `draw` does.
-
-        Args:
-            group: Group of each row, int64 ``[S, *R]``.
-            generator: Random generators of the seeds, in place of the replay's.
-
-        Returns:
-            By key: ``"latent"``, the constant entries, ``"action"``, ``"priority_weight"``.
-        """
+        """Draw latents, with noise, and actions to imitate: as `draw`, without ``"next"``."""
         sources = self._generators if generator is None else generator
         entries, _, frame, _ = self._draw_frames(group, sources)
         state = self._states(frame)
@@ -159,8 +152,7 @@ class DemonstrationReplay:
         share = draw_for_rows(torch.rand, group, sources, dtype=torch.float64)
         number, constants = shown["demo_index"], shown
         if not self._own_constants:
-            keys = [*self._constant_keys]
-            constants = self._shown.draw(group, generator=sources, keys=keys)
+            constants = self._shown.draw(group, generator=sources, keys=self._constant_keys)
         n_steps = steps.length[number] - 1
         step = (share * n_steps).long()
         frame = steps.first[number] + step

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from operator import index
 from pathlib import Path
@@ -14,17 +15,17 @@ import torch
 from tensordict import TensorDict
 
 from bgpo_trl.data.dataset import (
-    check_episode,
+    META,
+    NUMBERS,
     checksum_of,
-    is_dataset,
     layout_of,
     load_demonstrations,
     make_dataset,
     open_dataset,
     read_meta,
-    write_meta,
 )
 from bgpo_trl.files.progress import progress_bar
+from bgpo_trl.files.writing import write_json
 from bgpo_trl.scenes import Scene, Simulation, find_scene
 from bgpo_trl.scenes.check import check_scene
 from bgpo_trl.scenes.scene import checked_frame, checked_numbers, checked_step
@@ -101,7 +102,7 @@ def record_demonstrations(
             f"held_out_per_task is {held_out_per_task}: it must be less than per_task, {per_task}"
         )
     wanted = {
-        **layout_of(scene),
+        **layout_of(scene, NUMBERS, scene.max_steps),
         "tasks": list(tasks),
         "rows": per_task * len(tasks),
         "per_task": per_task,
@@ -111,7 +112,7 @@ def record_demonstrations(
         **({"play": True} if play else {}),
     }
     path = Path(path)
-    started = is_dataset(path)
+    started = (path / META).exists()
     if started:
         meta = read_meta(path)
         found = {key: meta.get(key) for key in {**wanted, **meta} if key != "checksum"}
@@ -128,11 +129,11 @@ def record_demonstrations(
     env = scene.simulate(tasks, batch_size=1, spread=spread, observation=observation)
     dataset = open_dataset(path, wanted) if started else make_dataset(path, wanted)
     if not started:
-        write_meta(path, wanted)
+        write_json(path / META, wanted)
     recorder = _Recorder(scene, env.simulations[0], seed, attempts)
     _record_rows(dataset, recorder, wanted, progress)
     env.close()
-    write_meta(path, {**wanted, "checksum": checksum_of(dataset)})
+    write_json(path / META, {**wanted, "checksum": checksum_of(dataset)})
     return dataset
 
 
@@ -142,18 +143,23 @@ class _Recorder:
     def __init__(self, scene: Scene, simulation: Simulation, seed: int, attempts: int) -> None:
         self.scene, self.simulation = scene, simulation
         self.seed, self.attempts = seed, attempts
+        self.tried, self.succeeded = Counter[str](), Counter[str]()
 
-    def demonstrate(self, task: str, row: int) -> tuple[dict[str, np.ndarray] | None, int]:
-        """Return the first success, or ``None``, and the number of attempts."""
+    def demonstrate(self, task: str, row: int) -> dict[str, np.ndarray]:
+        """Return the first success; raise ``RuntimeError`` if too many attempts fail."""
         sequence = np.random.SeedSequence([self.seed, row])
-        for attempt in range(1, self.attempts + 1):
+        for _ in range(self.attempts):
             start, noise = (int(child.generate_state(1)[0]) for child in sequence.spawn(2))
-            episode, success = perform(
-                self.scene, self.simulation, task, start, noise, lambda demonstrator: demonstrator
-            )
+            episode, success = perform(self.scene, self.simulation, task, start, noise)
+            self.tried[task] += 1
             if success:
-                return episode, attempt
-        return None, self.attempts
+                self.succeeded[task] += 1
+                return episode
+        succeeded, tried = self.succeeded[task], self.tried[task]
+        raise RuntimeError(
+            f"the demonstrator of {task!r} failed {self.attempts} times in a row ({succeeded} of "
+            f"{tried} attempts succeeded, {succeeded / tried:.0%}): fix it, or raise attempts"
+        )
 
     def play(self, task: str, row: int) -> dict[str, np.ndarray]:
         """Return an episode that follows a demonstration, then moves at random.
@@ -187,68 +193,56 @@ def perform(
     task: str,
     start: int,
     noise: int,
-    policy_of: Callable[[_Policy], _Policy],
+    policy_of: Callable[[_Policy], _Policy] = lambda demonstrator: demonstrator,
 ) -> tuple[dict[str, np.ndarray], bool]:
     """Return an episode as for `write_demonstrations`, and whether it succeeded.
 
-    Args:
-        scene: The robot, with a demonstrator.
-        simulation: One of its simulations.
-        task: Name of the task.
-        start: Seed of the start.
-        noise: Seed of the demonstrator.
-        policy_of: Returns the policy that acts, given the demonstrator's.
+    ``start`` and ``noise`` are the seeds of simulation and demonstrator. ``policy_of`` returns the
+    policy that acts, given the demonstrator's.
 
     Raises:
-        ValueError: If an action has another size or is not finite, or the simulation returns what
+        ValueError: If an action is not ``[A]`` in [-1, 1], or the simulation returns what
             `Simulation` does not allow.
     """
+
+    def observe() -> dict[str, np.ndarray]:
+        moment: dict[str, np.ndarray] = {"pixels": checked_frame(simulation, scene.frame_shape)}
+        if scene.state is not None:
+            moment["state"] = checked_numbers(simulation, "state", scene.state.size)
+        if scene.joints is not None:
+            moment["joints"] = checked_numbers(simulation, "joints", scene.joints.size)
+        return moment
+
     simulation.seed(start)
     simulation.reset(task)
     assert scene.demonstrator is not None
-    act, shape = policy_of(scene.demonstrator(simulation, task, noise)), scene.frame_shape
-    frames, numbers = [checked_frame(simulation, shape)], [_numbers(scene, simulation)]
-    actions, success = [], False
+    act = policy_of(scene.demonstrator(simulation, task, noise))
+    whose = f"an episode of the demonstrator of {task!r}"
+    moments, actions, success = [observe()], [], False
     for _ in range(scene.max_steps):
         action = np.array(act())  # a copy, since a policy may use its array again
         # Every simulation would make something else of such an action.
         if action.shape != (scene.action_size,) or not np.isfinite(action).all():
+            found = short_repr(action.tolist())
+            raise ValueError(f"{whose} has the action {found}: give {scene.action_size}, finite")
+        if (largest := np.float32(np.abs(action).max())) > 1:
             raise ValueError(
-                f"an episode of the demonstrator of {task!r} has the action "
-                f"{short_repr(action.tolist())}: give {scene.action_size}, finite"
+                f"{whose} has an action of size {largest:.4g}: scale actions to [-1, 1]"
             )
         success, failure, executed = checked_step(simulation, action)
         actions.append(executed)
-        frames.append(checked_frame(simulation, shape))
-        numbers.append(_numbers(scene, simulation))
+        moments.append(observe())
         if success or failure:
             break
-    episode = {"pixels": np.stack(frames), "action": np.stack(actions)}
-    episode |= {key: np.stack([moment[key] for moment in numbers]) for key in numbers[0]}
-    try:
-        check_episode(scene, episode)
-    except ValueError as error:
-        raise ValueError(f"an episode of the demonstrator of {task!r} {error}") from None
-    return episode, success
-
-
-def _numbers(scene: Scene, simulation: Simulation) -> dict[str, np.ndarray]:
-    """Return ground truth and joints, where the scene has some."""
-    found = dict[str, np.ndarray]()
-    if scene.state is not None:
-        found["state"] = checked_numbers(simulation, "state", scene.state.size)
-    if scene.joints is not None:
-        found["joints"] = checked_numbers(simulation, "joints", scene.joints.size)
-    return found
+    episode = {key: np.stack([moment[key] for moment in moments]) for key in moments[0]}
+    return {**episode, "action": np.stack(actions)}, success
 
 
 def _record_rows(
     dataset: TensorDict, recorder: _Recorder, wanted: Mapping[str, Any], progress: bool
 ) -> None:
-    tasks, per_task, seed = wanted["tasks"], wanted["per_task"], wanted["seed"]
-    play, n_shown = "play" in wanted, per_task - wanted["held_out_per_task"]
+    play, per_task = "play" in wanted, wanted["per_task"]
     missing = torch.nonzero(dataset["length"] == 0).flatten().tolist()
-    tried, done = [0] * len(tasks), [0] * len(tasks)
     bar = progress_bar(
         "record play" if play else "record demonstrations",
         missing,
@@ -258,23 +252,13 @@ def _record_rows(
         unit="episode",
     )
     for row in bar:
-        task = row // per_task
-        if play:
-            episode = recorder.play(tasks[task], row)
-        else:
-            episode, tries = recorder.demonstrate(tasks[task], row)
-            tried[task] += tries
-            if episode is None:
-                raise RuntimeError(
-                    f"the demonstrator of {tasks[task]!r} failed {recorder.attempts} times in a "
-                    f"row ({done[task]} of {tried[task]} attempts succeeded, "
-                    f"{done[task] / tried[task]:.0%}): fix it, or raise attempts"
-                )
-            done[task] += 1
+        task, number = divmod(row, per_task)
+        record = recorder.play if play else recorder.demonstrate
+        episode = record(wanted["tasks"][task], row)
         for key, values in episode.items():
             dataset[key][row, : len(values)] = torch.from_numpy(values)
         dataset["task"][row] = task
-        dataset["seed"][row] = seed
-        dataset["train"][row] = row % per_task < n_shown
+        dataset["seed"][row] = wanted["seed"]
+        dataset["train"][row] = number < per_task - wanted["held_out_per_task"]
         # Written last, since a row whose length is 0 is recorded again.
         dataset["length"][row] = len(episode["pixels"])

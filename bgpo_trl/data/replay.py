@@ -221,8 +221,8 @@ class GroupReplay:
                 if len(held):
                     steps[seed, place, : len(held)] = held
                     weight[seed, place, : len(held)] = n_rows / len(held)
-            steps[seed] = steps[seed] % self.capacity * len(self._generators) + seed
-        rows, counts = torch.from_numpy(steps).flatten(), torch.from_numpy(weight)
+        rows = self._rows_of(steps.reshape(len(steps), -1), range(len(steps)))
+        counts = torch.from_numpy(weight)
         drawn = TensorDict({"priority_weight": counts}, counts.shape)
         for key in [key for key in self._rows if key != _GROUP]:
             stored = self._rows[key]
@@ -351,16 +351,9 @@ class GroupReplay:
         if min(stored_numbers, default=0) < 0:
             raise ValueError(f"a group must be at least 0, got {numbers}")
         keys = [*self._keys, *([] if self._source_key is None else [self._source_key])]
-        entries: dict[Any, Tensor] = {}
-        for key in keys:
-            entry = transition.get(key, None)
-            if entry is None:
-                raise missing_key("GroupReplay", transition, keys)
-            if isinstance(entry, TensorDictBase):
-                parts = TensorDict({key: entry}, entry.batch_size[:1])
-                entries |= dict(parts.items(True, True))
-            else:
-                entries[key] = entry
+        entries: dict[Any, Tensor] = {key: transition.get(key, None) for key in keys}
+        if any(entry is None for entry in entries.values()):
+            raise missing_key("GroupReplay", transition, keys)
         for key in [key for key in self._rows if key != _GROUP]:
             entry, stored = entries.get(key), self._rows[key]
             if entry is None or entry.shape[1:] != stored.shape[1:] or entry.dtype != stored.dtype:

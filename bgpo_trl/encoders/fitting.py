@@ -1,9 +1,6 @@
 """Train the two encoders on demonstrations and play (Sec. III-A).
 
-`train_representation` first trains the VAE with its inverse model on the frames of demonstrations
-and play, or takes a frame network of one's own (`FRAME_NETWORKS`). Then it trains the LSTM
-autoencoder and the inverse model on the latents. Datasets are those of
-`bgpo_trl.encoders.representation`.
+Datasets are those of `bgpo_trl.encoders.representation`.
 """
 
 from __future__ import annotations
@@ -27,8 +24,8 @@ from bgpo_trl.encoders.representation import (
     encode_frames,
     initialized,
     mean_frame,
+    part,
     split,
-    training_part,
     valid_frames,
     valid_steps,
 )
@@ -62,8 +59,9 @@ def train_representation(
 ) -> Representation:
     """Train both encoders on the training demonstrations.
 
-    A frame network of one's own (``config.frame_network``) is taken as it is, and only the scale of
-    its latents is set.
+    The VAE with its inverse model comes first; the LSTM autoencoder and the inverse model are
+    trained on its latents. A frame network of one's own (``config.frame_network``) is taken as it
+    is, and only the scale of its latents is set.
 
     Args:
         dataset: Demonstrations in the form given by the module; held-out ones are not read.
@@ -89,14 +87,15 @@ def train_representation(
     """
     config = config or RepresentationConfig()
     train, _ = split(dataset)
-    seen = [train] if play is None else [train, training_part(play, "the recorded play")]
+    seen = [train] if play is None else [train, part(play, "the recorded play")]
     own = seen[-1]
     _check_actions(train, own, config.inverse)
     fit = Fit(config, **how)
-    if config.frame_network == "vae":
-        network = _train_vae(seen, fit)
-    else:
-        network = _take_frame_network(seen, fit)
+    network = _frame_network(seen, fit)
+    named = {}
+    if network.identity != VAE.identity:
+        shape = json.dumps(network.frame_shape)
+        named = {"frame_network": network.identity, "frame_shape": shape}
         fit = replace(fit, taken=f"{network.identity} {digest(network.state_dict())}")
     latent = encode_frames(network, train)
     lae = _train_lae(latent, train.get("length"), fit)
@@ -109,10 +108,8 @@ def train_representation(
         "config": json.dumps(asdict(config)),
         "seed": str(config.seed),
         "command": command,
+        **named,
     }
-    if network.identity != VAE.identity:
-        shape = json.dumps(network.frame_shape)
-        metadata |= {"frame_network": network.identity, "frame_shape": shape}
     return Representation(network.cpu(), lae, inverse, metadata)
 
 
@@ -134,7 +131,7 @@ def retrain_inverse(
     errors are as for `train_representation`; play without actions is refused, too.
     """
     fit = Fit(config or RepresentationConfig(), **how)
-    own = training_part(play, "the recorded play")
+    own = part(play, "the recorded play")
     if "action" not in own:
         raise ValueError("the inverse model learns from actions, which this play lacks: record it")
     _check_actions(shown, own, fit.config.inverse)
@@ -204,9 +201,8 @@ class Fit:
         optimizer = torch.optim.Adam(network.parameters(), lr=schedule.learning_rate)
         path = Path(self.checkpoint) / stage if self.checkpoint else None
         start = self._resume(path, network, optimizer, generator)
-        rows = range(start, steps)
-        shown = {"shown": self.progress, "initial": start, "total": steps}
-        bar = progress_bar(f"train {stage}", rows, **shown)
+        counts = {"initial": start, "total": steps}
+        bar = progress_bar(f"train {stage}", range(start, steps), shown=self.progress, **counts)
         for step in bar:
             rate = schedule.learning_rate * min(1.0, (step + 1) / schedule.warmup_steps)
             if schedule.decay:
@@ -268,32 +264,26 @@ class Fit:
         return saved["step"]
 
 
-def _take_frame_network(datasets: Sequence[TensorDictBase], fit: Fit) -> FrameNetwork:
-    """Return a frame network of one's own, with the scale of its latents in some datasets."""
-    frames, (name, seed) = _frames_of(datasets), (fit.config.frame_network, fit.config.seed)
-    network = initialized(seed, make_frame_network, name, frames.shape[1:3]).to(fit.device)
-    _set_scale(network, frames, fit)
-    return network
-
-
-def _frames_of(datasets: Sequence[TensorDictBase]) -> Tensor:
-    return torch.cat([valid_frames(dataset) for dataset in datasets])
-
-
-def _set_scale(network: FrameNetwork, frames: Tensor, fit: Fit) -> None:
-    """Set the scale of latents from frames uint8 ``[F, H, W, 3]``."""
+def _frame_network(datasets: Sequence[TensorDictBase], fit: Fit) -> FrameNetwork:
+    """Train the VAE, or take a frame network of one's own; set the scale of its latents."""
+    frames = torch.cat([valid_frames(dataset) for dataset in datasets])
+    name, seed = fit.config.frame_network, fit.config.seed
+    if name == "vae":
+        network = _train_vae(datasets, frames, fit)
+    else:
+        network = initialized(seed, make_frame_network, name, frames.shape[1:3]).to(fit.device)
     chunks = (chunk.to(fit.device) for chunk in frames.split(64))
     with torch.no_grad():
         network.set_latent_scale(torch.cat([network.features(chunk) for chunk in chunks]))
+    return network
 
 
-def _train_vae(datasets: Sequence[TensorDictBase], fit: Fit) -> VAE:
-    """Train the VAE on frames of datasets, and its inverse model on actions of the last one."""
+def _train_vae(datasets: Sequence[TensorDictBase], frames: Tensor, fit: Fit) -> VAE:
+    """Train the VAE on the frames of datasets, and its inverse model on actions of the last one."""
     config, own = fit.config.vae, datasets[-1]
     length = torch.cat([dataset.get("length") for dataset in datasets])
     if length.max() < config.window:
         raise ValueError(f"the dataset has no training demonstration of {config.window} frames")
-    frames = _frames_of(datasets)
     # Actions of demonstrations are unknown, unless there is no play to learn from.
     n_known = int(own.get("length").sum()) if "action" in own else 0
     n_unknown = len(frames) - n_known
@@ -303,13 +293,9 @@ def _train_vae(datasets: Sequence[TensorDictBase], fit: Fit) -> VAE:
         padded = torch.nn.functional.pad(own.get("action"), (0, 0, 0, 1))
         known = padded[valid_steps(own.get("length"), padded.shape[1])]
         action = torch.cat([known.new_zeros(n_unknown, known.shape[-1]), known])
-    first = length.cumsum(0) - length
-    starts = torch.cat(
-        [
-            torch.arange(int(f), int(f) + int(n) - config.window + 1)
-            for f, n in zip(first, length, strict=True)
-        ]
-    )
+    # Frames from which the episode has as many left as a window.
+    n_left = torch.cat([torch.arange(n, 0, -1) for n in length.tolist()])
+    starts = (n_left >= config.window).nonzero().flatten()
 
     def sample(generator: torch.Generator) -> TensorDict:
         n_windows = config.batch_size // config.window
@@ -335,9 +321,7 @@ def _train_vae(datasets: Sequence[TensorDictBase], fit: Fit) -> VAE:
         emulated = "this processor has no instructions for bfloat16: computing in float32"
         warnings.warn(emulated, stacklevel=2)
     fit("vae", vae, loss_of, sample, generator, bfloat16)
-    vae.eval().requires_grad_(False)
-    _set_scale(vae, frames, fit)
-    return vae
+    return vae.eval().requires_grad_(False)
 
 
 def _steps_to_infer(episodes: TensorDictBase, config: InverseModelConfig) -> tuple[Tensor, Tensor]:
@@ -354,12 +338,12 @@ def _check_actions(
     """Check, before hours of training, that the inverse model sees what it is to infer.
 
     Args:
-        shown: Demonstrations.
-        own: Episodes that it learns from.
+        shown: Demonstrations, of whose actions at most a twentieth may be left out.
+        own: Episodes that it learns from; some of their actions have to be left.
         config: Its settings.
 
     Raises:
-        ValueError: If there is nothing to learn from, or hardly what demonstrations do.
+        ValueError: If more actions are left out.
     """
     for episodes, most in ((shown, 0.05), (own, 1.0)):
         if episodes is None or "action" not in episodes:

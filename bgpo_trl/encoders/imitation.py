@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.modules.stacked_mlp import StackedLinear
+from bgpo_trl.modules.stacked_mlp import StackedMLP
 
 _NOISES = (0.0, 0.02, 0.05, 0.1, 0.2)
 _FEWEST, _MOST = 8, 125  # demonstrations of a task, of which a fifth judges
@@ -50,25 +50,20 @@ def _errors(bank: DemonstrationBank) -> Tensor:
     n_judges = len(order) // 5
     (state, action), (unseen, true) = _steps(bank, order[n_judges:]), _steps(bank, order[:n_judges])
     alike = [torch.Generator().manual_seed(1) for _ in _NOISES]
-    clones = nn.Sequential(
-        StackedLinear(state.shape[-1], 256, len(_NOISES), alike),
-        nn.ReLU(),
-        StackedLinear(256, 256, len(_NOISES), alike),
-        nn.ReLU(),
-        StackedLinear(256, action.shape[-1], len(_NOISES), alike),
-        nn.Tanh(),
-    )
+    sizes = (state.shape[-1], action.shape[-1])
+    clones = StackedMLP(*sizes, hidden_sizes=(256, 256), batch_size=len(_NOISES), generator=alike)
     noise = torch.tensor(_NOISES)[:, None, None]
     optimizer = torch.optim.Adam(clones.parameters(), lr=1e-3)
     for _ in range(_N_UPDATES):
         row = torch.randint(len(state), (_N_ROWS,), generator=generator)
         blur = torch.randn(_N_ROWS, state.shape[-1], generator=generator)
-        loss = (clones(state[row] + noise * blur) - action[row]).square().sum()
+        loss = (clones(state[row] + noise * blur).tanh() - action[row]).square().sum()
         optimizer.zero_grad()
         (loss / _N_ROWS).backward()
         optimizer.step()
     with torch.no_grad():
-        return (clones(unseen.expand(len(_NOISES), *unseen.shape)) - true).square().mean((1, 2))
+        cloned = clones(unseen.expand(len(_NOISES), *unseen.shape)).tanh()
+    return (cloned - true).square().mean((1, 2))
 
 
 def _steps(bank: DemonstrationBank, rows: Tensor) -> tuple[Tensor, Tensor]:

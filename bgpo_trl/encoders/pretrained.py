@@ -36,19 +36,14 @@ def load_pretrained(
     scene = find_scene(scene)
     weights = default_weights(tasks, scene=scene) if weights is None else Path(weights)
     encoders = load_representation(weights, scene=scene)
-    path = bank_path(weights)
-    bank = DemonstrationBank.load(path, encoder_id=encoders.identity)
-    if bank.scene is not None:
-        scene.check_identity(bank.scene, path, "record and embed demonstrations of this scene")
-    return encoders, bank
+    return encoders, DemonstrationBank.load(bank_path(weights), encoder_id=encoders.identity)
 
 
 def default_weights(tasks: Sequence[str] | None = None, *, scene: Scene | str = "nico") -> Path:
-    """Return the path of the encoders that come with a scene, for some of its tasks.
+    """Return the path of the encoders that come with a scene: the first with the most of the tasks.
 
-    These are the first with the most of the tasks. For NICO, they are the encoders of eight tasks
-    if one of the suite's further five is among them, and otherwise, also for custom tasks, those of
-    the paper's three.
+    For NICO, they are the encoders of eight tasks if one of the suite's further five is among them,
+    and otherwise, also for custom tasks, those of the paper's three.
 
     Raises:
         ValueError: If none come with the scene.

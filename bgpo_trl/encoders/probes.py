@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,11 +19,13 @@ import numpy as np
 import torch
 from scipy import ndimage
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
+from torchrl.modules import MLP
 
 from bgpo_trl.encoders.representation import (
     Representation,
     encode_frames,
+    initialized,
     mean_frame,
     split,
     valid_frames,
@@ -87,7 +90,9 @@ def probe(
     result |= _probe_inverse(representation.inverse, train, columns)
     if isinstance(network, VAE):
         result |= _probe_reconstruction(network, train.data, held_out.data)
-    result |= _probe_sequences(lae, held_out)
+    sequences = TensorDict({"latent": held_out.latent, "length": held_out.length})
+    error = sequence_reconstruction_loss(lae, sequences)["loss_reconstruction"]
+    result["sequence_mse"] = error.item()
     spread = (train.latent * network.latent_std)[train.valid].std(0)
     result["active_dimensions"] = float((spread > 0.1 * spread.max()).sum())
     result |= _probe_tasks(lae, train, held_out)
@@ -196,10 +201,7 @@ def judged(result: Mapping[str, float], scene: Scene) -> dict[str, float]:
 
 
 def complaints(result: Mapping[str, float]) -> list[str]:
-    """Return what is not good about encoders, a line each with what to do; none if all is good.
-
-    Args:
-        result: Result of `probe`.
+    """Return what is not good in a result of `probe`, a line each with what to do.
 
     Examples:
         >>> good = {"task_accuracy_nearest": 0.97, "task_accuracy_chance": 0.5}
@@ -215,10 +217,7 @@ def complaints(result: Mapping[str, float]) -> list[str]:
 
 
 def verdict(result: Mapping[str, float]) -> str:
-    """Return a table of what `complaints` judges.
-
-    Args:
-        result: Result of `probe`.
+    """Return a table of what `complaints` judges in a result of `probe`.
 
     Examples:
         >>> print(verdict({"task_accuracy_nearest": 1.0, "things_lost": 0.2}))
@@ -267,15 +266,8 @@ def perceptron_predict(x: Tensor, y: Tensor, x_new: Tensor, steps: int = 6_000) 
     generator = torch.Generator().manual_seed(0)
     (scale, center), (unit, offset) = torch.std_mean(x, 0), torch.std_mean(y, 0)
     scale, unit = scale.clamp_min(1e-6), unit.clamp_min(1e-6)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        network = torch.nn.Sequential(
-            torch.nn.Linear(x.shape[1], 256),
-            torch.nn.ReLU(),
-            torch.nn.Linear(256, 256),
-            torch.nn.ReLU(),
-            torch.nn.Linear(256, y.shape[1]),
-        )
+    sizes = (x.shape[1], y.shape[1])
+    network = initialized(0, partial(MLP, *sizes, num_cells=[256, 256], activation_class=nn.ReLU))
     optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for _ in range(steps):
@@ -422,12 +414,6 @@ def share_lost(frames: Tensor, decoded: Tensor, background: Tensor) -> float:
         lost.append((missed > 0.5 * shown)[sizes >= _THING])
     found = np.concatenate(lost)
     return float(found.mean()) if len(found) else 0.0
-
-
-@torch.no_grad()
-def _probe_sequences(lae: SequenceAutoencoder, held_out: _Encoded) -> dict[str, float]:
-    data = TensorDict({"latent": held_out.latent, "length": held_out.length}, [len(held_out.data)])
-    return {"sequence_mse": sequence_reconstruction_loss(lae, data)["loss_reconstruction"].item()}
 
 
 def _mean(values: Tensor) -> float:

@@ -71,10 +71,7 @@ class Representation:
     def check_scene(self, scene: Scene, what: object, remedy: str) -> None:
         """Raise ``ValueError`` unless the encoders are of a scene, and of its frames' size.
 
-        Args:
-            scene: The robot.
-            what: Name of the encoders, such as their path, which begins the message.
-            remedy: What to do if they are of another version of the scene.
+        ``what`` and ``remedy`` are as for `Scene.check_identity`.
         """
         scene.check_identity(self.metadata.get("scene"), what, remedy)
         found, wanted = [*self.frame_network.frame_shape], [*scene.frame_shape]
@@ -188,7 +185,13 @@ def _of_tensors(tensors: Mapping[str, Tensor], metadata: dict[str, str]) -> Repr
     """Return encoders of the tensors and metadata of a file."""
     config = json.loads(metadata["config"])
     if "frame_network" in metadata:
-        network = _named_frame_network(metadata)
+        identity, shape = metadata["frame_network"], json.loads(metadata["frame_shape"])
+        network = initialized(0, make_frame_network, identity.partition(" ")[0], shape)
+        if network.identity != identity:
+            raise FrameNetworkError(
+                f"it is of the frame network {identity!r}, the imported module has "
+                f"{network.identity!r}: use the version of the module, or train new ones"
+            )
     else:
         network = VAE(
             config["vae"]["latent_size"],
@@ -211,18 +214,6 @@ def _of_tensors(tensors: Mapping[str, Tensor], metadata: dict[str, str]) -> Repr
     return encoders
 
 
-def _named_frame_network(metadata: Mapping[str, str]) -> FrameNetwork:
-    """Return the frame network of one's own that metadata name, with other weights."""
-    identity, shape = metadata["frame_network"], json.loads(metadata["frame_shape"])
-    network = initialized(0, make_frame_network, identity.partition(" ")[0], shape)
-    if network.identity != identity:
-        raise FrameNetworkError(
-            f"it is of the frame network {identity!r}, the imported module has "
-            f"{network.identity!r}: use the version of the module, or train new ones"
-        )
-    return network
-
-
 def _tensors(representation: Representation) -> dict[str, Tensor]:
     return {
         f"{prefix}{key}": value
@@ -234,31 +225,24 @@ def _tensors(representation: Representation) -> dict[str, Tensor]:
 def split(
     dataset: TensorDictBase, name: str = "the dataset"
 ) -> tuple[TensorDictBase, TensorDictBase]:
-    """Return the training and the held-out episodes, by the key ``train``; ``name`` is for errors.
-
-    Raises:
-        ValueError: If either set is empty.
-    """
-    chosen = dataset.get("train").bool()
-    if chosen.all():
-        raise ValueError(
-            f"{name} has no held-out episodes (key 'train'): record or write it with "
-            "held_out_per_task of at least 1"
-        )
-    return training_part(dataset, name), dataset[~chosen]  # pyright: ignore[reportReturnType]
+    """Return the training and the held-out episodes, see `part`."""
+    held_out = part(dataset, name, held_out=True)
+    return part(dataset, name), held_out
 
 
-def training_part(dataset: TensorDictBase, name: str) -> TensorDictBase:
-    """Return the training episodes, by the key ``train``; ``name`` is for errors.
+def part(dataset: TensorDictBase, name: str, *, held_out: bool = False) -> TensorDictBase:
+    """Return the training or the held-out episodes, by the key ``train``; ``name`` is for errors.
 
     Raises:
         ValueError: If there are none.
     """
-    chosen = dataset.get("train").bool()
+    chosen = dataset.get("train").bool() != held_out
     if not chosen.any():
+        lacking = "held-out episodes" if held_out else "episodes to train on"
+        bound = "of at least 1" if held_out else "below the number of episodes of each task"
         raise ValueError(
-            f"{name} has no episodes to train on (key 'train'): record or write it with a "
-            "held_out_per_task below the number of episodes of each task"
+            f"{name} has no {lacking} (key 'train'): record or write it with a held_out_per_task "
+            f"{bound}"
         )
     return dataset[chosen]  # pyright: ignore[reportReturnType]
 

@@ -23,8 +23,8 @@ from bgpo_trl.encoders.probes import complaints, judged, probe
 from bgpo_trl.encoders.representation import (
     Representation,
     encode_frames,
+    part,
     save_representation,
-    split,
 )
 from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.files.writing import check_folder, make_folder
@@ -74,27 +74,31 @@ def train_encoders(
             there is ground truth to probe held-out play with, and no such play.
         OSError: If a file cannot be written.
     """
-    if keep is not None and play is None:
-        raise ValueError("to train the inverse model alone, give the folder of recorded play")
     scene = find_scene(scene)
-    if play is not None and keep is None and scene.state is not None and "state" in play:
-        split(play, "the recorded play")  # before hours of training, at whose end it is probed
     if config.inverse.largest_action is None:
         inverse = replace(config.inverse, largest_action=scene.largest_action)
         config = replace(config, inverse=inverse)
+    if keep is None:
+        if play is not None and scene.state is not None and "state" in play:
+            part(play, "the recorded play", held_out=True)  # probed after hours of training
+        parts = {"play": play, "scene": scene.identity, "spread": spread}
+        fit = partial(train_representation, dataset, config, **parts)
+    elif play is None:
+        raise ValueError("to train the inverse model alone, give the folder of recorded play")
+    else:
+        fit = partial(retrain_inverse, keep, play, config, shown=dataset)
     make_folder(folder)
     check_folder(weights.parent)  # before hours of training
     with CsvFile(folder / "train.csv", _COLUMNS) as file:
-        how: dict[str, Any] = {"command": command, "checkpoint": folder / "checkpoint"}
-        how |= {"log": _log_of(file), "progress": progress, "device": device}
-        if keep is not None and play is not None:
-            representation = retrain_inverse(keep, play, config, shown=dataset, **how)
-        else:
-            how |= {"scene": scene.identity, "spread": spread}
-            representation = train_representation(dataset, config, play=play, **how)
+        representation = fit(
+            command=command,
+            checkpoint=folder / "checkpoint",
+            log=_log_of(file),
+            progress=progress,
+            device=device,
+        )
     save_representation(representation, weights)
-    actions = scene.bank_actions
-    made = {"tasks": tasks, "actions": actions, "spread": spread}
+    made = {"tasks": tasks, "actions": scene.bank_actions, "spread": spread}
     bank = make_bank(representation, dataset, **made, compare=False)
     bank.save(bank_path(weights))
     play = None if keep else play
@@ -172,22 +176,9 @@ def make_pretrained(
 ) -> tuple[Representation, DemonstrationBank]:
     """Record demonstrations and play, train both encoders, and embed the demonstrations.
 
-    Each interrupted stage is resumed.
-
-    Args:
-        weights: File to write the encoders to; the bank is written beside it.
-        dataset: Folder of the demonstrations, recorded if missing. Half as many episodes of play go
-            to the folder of the same name plus ``-play``.
-        folder: Folder for the training log, checkpoints and probes.
-        config: Hyperparameters of the encoders.
-        per_task: Demonstrations of each task.
-        held_out_per_task: How many of those are held out.
-        seed: Seed of the recording.
-        tasks: Names of the tasks; by default the scene's.
-        scene: The robot, or its name.
-        command: Command line, stored with the weights.
-        device: Device to train on.
-        **shared: ``spread`` and ``progress``, as for `record_demonstrations` and `train_encoders`.
+    Demonstrations are recorded into the folder ``dataset``, and half as many episodes of play into
+    the folder of the same name plus ``-play``; each interrupted stage is resumed. Other arguments
+    are as for `record_demonstrations` and `train_encoders`, ``shared`` those of both.
 
     Raises:
         ValueError: If the dataset is damaged or was recorded in another scene.

@@ -42,41 +42,44 @@ def check_scene(scene: Scene, tasks: Sequence[str] | None = None) -> list[str]:
             if isinstance(env, RobotEnv):
                 return []
             simulations += env.simulations
-        doubts = [doubt for task in tasks for doubt in _Trial(scene, task).doubts(*simulations)]
+        doubts = list[str]()
+        for task in tasks:
+            trial, other = (_Trial(scene, task, simulation) for simulation in simulations)
+            doubts += trial.doubts(other)
     return list(dict.fromkeys(doubts))
 
 
 class _Trial:
-    """One task, tried."""
+    """One task, tried in a simulation."""
 
-    def __init__(self, scene: Scene, task: str) -> None:
-        self.scene, self.task = scene, task
+    def __init__(self, scene: Scene, task: str, simulation: Simulation) -> None:
+        self.scene, self.task, self.simulation = scene, task, simulation
 
-    def doubts(self, simulation: Simulation, other: Simulation) -> list[str]:
+    def doubts(self, other: _Trial) -> list[str]:
         """Return what is doubtful; raise ``ValueError`` for what is wrong."""
-        starts = [self.start(simulation, seed) for seed in range(_N_STARTS)]
-        simulation.seed(0)
-        other.seed(1)
-        for begun, start in ((simulation, starts[0]), (other, starts[1])):
-            if differ(self.reset(begun), start):
+        starts = [self.start(seed) for seed in range(_N_STARTS)]
+        self.simulation.seed(0)
+        other.simulation.seed(1)
+        for begun, start in ((self, starts[0]), (other, starts[1])):
+            if differ(begun.reset(), start):
                 raise ValueError(
                     f"two episodes of {self.task!r} with one seed begin differently: "
-                    f"{type(simulation).__name__}.seed() has to decide all that is drawn, and in "
-                    "its own simulation only"
+                    f"{type(self.simulation).__name__}.seed() has to decide all that is drawn, and "
+                    "in its own simulation only"
                 )
-        again = [self.reset(simulation) for _ in starts]
+        again = [self.reset() for _ in starts]
         doubts = list[str]()
         for several, what in ((starts, "with whatever seed"), (again, "reset after reset")):
             if not any(differ(frame, several[0]) for frame in several):
                 doubts.append(f"episodes begin with the same frame {what}: is a start drawn?")
-        if all(self.succeeds(simulation, seed) for seed in range(_N_STARTS)):
+        if all(self.succeeds(seed) for seed in range(_N_STARTS)):
             raise ValueError(
                 f"{self.task!r} has succeeded after one step without movement, from each of "
                 f"{_N_STARTS} starts: check reset() and success"
             )
-        return doubts + self.unseen(simulation)
+        return doubts + self.unseen()
 
-    def unseen(self, simulation: Simulation) -> list[str]:
+    def unseen(self) -> list[str]:
         """Return what actions do not change in frames."""
         size, doubts, prompt = self.scene.action_size, list[str](), False
         for component in range(size):
@@ -84,11 +87,7 @@ class _Trial:
             pairs = [
                 pair
                 for seed in range(_N_STARTS)
-                for pair in zip(
-                    self.play(simulation, seed, push),
-                    self.play(simulation, seed, -push),
-                    strict=True,
-                )
+                for pair in zip(self.play(seed, push), self.play(seed, -push), strict=True)
             ]
             if not any(differ(*pair) for pair in pairs):
                 doubts.append(
@@ -96,9 +95,9 @@ class _Trial:
                     "steps: does it move something that the camera sees?"
                 )
             prompt |= any(differ(*pair) for pair in pairs[::_N_STEPS])
-            self.start(simulation, 0)
-            checked_step(simulation, push)
-            if differ(self.frame(simulation), self.frame(simulation)):
+            self.start(0)
+            checked_step(self.simulation, push)
+            if differ(self.frame(), self.frame()):
                 return ["frame() differs when called twice: is it that of the step before?"]
         if len(doubts) < size and not prompt:
             doubts.append(
@@ -107,32 +106,29 @@ class _Trial:
             )
         return doubts
 
-    def play(
-        self, simulation: Simulation, seed: int, action: NDArray[np.float64]
-    ) -> list[NDArray[np.uint8]]:
+    def play(self, seed: int, action: NDArray[np.float64]) -> list[NDArray[np.uint8]]:
         """Return the frames after some steps with an action; an episode's last one stays."""
-        self.start(simulation, seed)
+        self.start(seed)
         frames, over = list[NDArray[np.uint8]](), False
         for _ in range(_N_STEPS):
-            if not over:
-                over = any(checked_step(simulation, action)[:2])
-            frames.append(self.frame(simulation))
+            over = over or any(checked_step(self.simulation, action)[:2])
+            frames.append(self.frame())
         return frames
 
-    def succeeds(self, simulation: Simulation, seed: int) -> bool:
-        self.start(simulation, seed)
-        return bool(checked_step(simulation, np.zeros(self.scene.action_size)).success)
+    def succeeds(self, seed: int) -> bool:
+        self.start(seed)
+        return bool(checked_step(self.simulation, np.zeros(self.scene.action_size)).success)
 
-    def start(self, simulation: Simulation, seed: int) -> NDArray[np.uint8]:
-        simulation.seed(seed)
-        return self.reset(simulation)
+    def start(self, seed: int) -> NDArray[np.uint8]:
+        self.simulation.seed(seed)
+        return self.reset()
 
-    def reset(self, simulation: Simulation) -> NDArray[np.uint8]:
-        simulation.reset(self.task)
-        return self.frame(simulation)
+    def reset(self) -> NDArray[np.uint8]:
+        self.simulation.reset(self.task)
+        return self.frame()
 
-    def frame(self, simulation: Simulation) -> NDArray[np.uint8]:
-        return checked_frame(simulation, self.scene.frame_shape)
+    def frame(self) -> NDArray[np.uint8]:
+        return checked_frame(self.simulation, self.scene.frame_shape)
 
 
 def differ(frame: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:

@@ -263,11 +263,12 @@ class Scene:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or len(self.name.split()) != 1:
             raise ValueError(f"the name of a scene is a word without spaces, got {self.name!r}")
-        if not isinstance(self.version, str) or not self.version.isprintable() or not self.version:
-            raise ValueError(f"the version of a scene is a printable string, got {self.version!r}")
-        for words in (*self.setup.keys(), *self.setup.values()):
-            if not isinstance(words, str) or not words.isprintable() or not words:
-                raise ValueError(f"the setup of a scene is printable strings, got {words!r}")
+        for what, text in (
+            ("version", self.version),
+            *(("setup", words) for words in (*self.setup.keys(), *self.setup.values())),
+        ):
+            if not isinstance(text, str) or not text.isprintable() or not text:
+                raise ValueError(f"the {what} of a scene is a printable string, got {text!r}")
         if "rate" in self.setup:
             raise ValueError("the rate of a scene is no part of its setup: give it as rate")
         if min(self.frame_shape) < 16 or len(self.frame_shape) != 2:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, get_args
 
 import numpy as np
@@ -107,14 +107,11 @@ class SimulationEnv(EnvBase):
         self._begun = np.zeros(count, dtype=bool)
         self._success, self._failure = np.zeros((2, count), dtype=bool)
         self._current: dict[str, np.ndarray] = {}
-        self._make_specs((*frame_shape, 3), state_size, action_size, joint_size)
+        sizes = {"state": None if observation == "pixels" else state_size, "joints": joint_size}
+        self._make_specs((*frame_shape, 3), action_size, sizes)
 
     def _make_specs(
-        self,
-        frame_shape: Sequence[int],
-        state_size: int | None,
-        action_size: int,
-        joint_size: int | None,
+        self, frame_shape: Sequence[int], action_size: int, sizes: Mapping[str, int | None]
     ) -> None:
         batch, count = self.batch_size, self.batch_size.numel()
         observation: dict[str, Any] = {
@@ -125,8 +122,7 @@ class SimulationEnv(EnvBase):
             shape = torch.Size(frame_shape)
             observation["pixels"] = Bounded(0, 255, shape=batch + shape, dtype=torch.uint8)
             self._current["pixels"] = np.zeros((count, *shape), np.uint8)
-        numbers = {"state": state_size if self.observation != "pixels" else None}
-        for key, size in {**numbers, "joints": joint_size}.items():
+        for key, size in sizes.items():
             if size is not None:
                 shape = torch.Size([*batch, size])
                 observation[key] = Unbounded(shape=shape, dtype=torch.float32)
@@ -139,13 +135,9 @@ class SimulationEnv(EnvBase):
         )
         # Not Bounded, which TorchRL's RewardScaling and RewardClipping refuse.
         self.reward_spec = Unbounded(shape=torch.Size([*batch, 1]), dtype=torch.float32)
-        self.done_spec = Composite(
-            {
-                key: Categorical(2, shape=torch.Size([*batch, 1]), dtype=torch.bool)
-                for key in ("done", "terminated", "truncated")
-            },
-            shape=batch,
-        )
+        flag = Categorical(2, shape=torch.Size([*batch, 1]), dtype=torch.bool)
+        flags = {key: flag.clone() for key in ("done", "terminated", "truncated")}
+        self.done_spec = Composite(flags, shape=batch)
 
     def _observe(self) -> dict[str, torch.Tensor]:
         done = self._success | self._failure
@@ -268,7 +260,6 @@ class SimulationEnv(EnvBase):
 
     def seed_rows(self, seeds: Sequence[int]) -> None:
         """Set the seeds of the simulations' start states; transforms are not reseeded."""
-        seeds = row_seeds(seeds, len(self.simulations))
         for simulation, seed in zip(self.simulations, seeds, strict=True):
             simulation.seed(seed)
 
@@ -293,22 +284,16 @@ class SimulationEnv(EnvBase):
         """Continue from what `simulation_state` returned.
 
         Raises:
-            ValueError: If it belongs to another number of simulations or kind of observation.
+            ValueError: If it belongs to other simulations.
         """
-        if len(state["simulations"]) != len(self.simulations):
+        if (
+            len(state["simulations"]) != len(self.simulations)
+            or state["current"].keys() != self._current.keys()
+            or int(state["task"].max()) >= len(self.tasks)
+        ):
             raise ValueError(
-                f"the state holds {len(state['simulations'])} simulations, this environment has "
-                f"{len(self.simulations)}: use the same number of seeds"
-            )
-        if state["current"].keys() != self._current.keys():
-            raise ValueError(
-                f"the state was saved with the observations {sorted(state['current'])}, this "
-                f"environment has {sorted(self._current)}: use the same observation"
-            )
-        if int(state["task"].max()) >= len(self.tasks):
-            raise ValueError(
-                f"the state was saved in task {int(state['task'].max())}, this environment has "
-                f"{len(self.tasks)} tasks: use the same tasks"
+                "the state was saved with another number of simulations, another kind of "
+                "observation or more tasks: use the same as it has"
             )
         for simulation, saved in zip(self.simulations, state["simulations"], strict=True):
             simulation.load(saved)
@@ -349,14 +334,5 @@ class RobotEnv(SimulationEnv):
                 "without tests (eval_episodes=0)"
             )
         super().__init__(*args, batch_size=batch_size, **kwargs)
-
-    def _make_specs(
-        self,
-        frame_shape: Sequence[int],
-        state_size: int | None,
-        action_size: int,
-        joint_size: int | None,
-    ) -> None:
-        super()._make_specs(frame_shape, state_size, action_size, joint_size)
         self.observation_spec["executed_action"] = self.action_spec.clone()
-        self._current["executed_action"] = np.zeros((1, action_size), np.float32)
+        self._current["executed_action"] = np.zeros((1, self._action_size), np.float32)

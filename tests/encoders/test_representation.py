@@ -321,6 +321,8 @@ def test_configurations_and_datasets_that_cannot_be_trained_on_are_refused() -> 
             replace(TINY.vae, window=window)
     with pytest.raises(ValueError, match="16 frames"):
         train(squares(8), replace(TINY, vae=replace(TINY.vae, window=16, batch_size=16)))
+    assert squares(8)["length"].min() < 7  # a shorter one than a window is left out
+    train(squares(8), replace(TINY, vae=replace(TINY.vae, window=8, batch_size=16)))
     shown = squares(8).set("train", torch.ones(8, dtype=torch.bool))
     with pytest.raises(ValueError, match=r"the dataset has no held-out .* held_out_per_task of at"):
         train(shown)
