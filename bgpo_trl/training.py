@@ -31,7 +31,7 @@ from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.cost import CostLog
 from bgpo_trl.runs.dashboard import Dashboard
 from bgpo_trl.runs.demonstrations import keep_inputs
-from bgpo_trl.runs.directory import RunLogger, digest_of_logged, fitting_checkpoint, load_last
+from bgpo_trl.runs.directory import digest_of_logged, fitting_checkpoint, load_last, open_tables
 from bgpo_trl.scenes import find_scene
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import TaskSchedule
@@ -156,13 +156,14 @@ class Trainer:
                 if encoders is not None:  # before config.json names tasks that may be added
                     keep_inputs(self.directory, bank, encoders, self._scene)
             self._cost = CostLog(self.directory / "cost.csv", resume=saved is not None)
-            self.logger = RunLogger(
-                self.directory,
-                config=self._settings,
-                logged=self.algorithm.logged,
-                position=saved["position"] if saved is not None else {} if resume else None,
+            self.tables = opened.enter_context(
+                open_tables(
+                    self.directory,
+                    config=self._settings,
+                    logged=self.algorithm.logged,
+                    position=saved["position"] if saved is not None else {} if resume else None,
+                )
             )
-            opened.enter_context(self.logger)
             # Runs without encoders cannot be loaded to watch demonstrations.
             if saved is None and encoders is not None:
                 keep_inputs(self.directory, bank, encoders, self._scene)
@@ -375,7 +376,7 @@ class Trainer:
         """Log an episode, or keep it if only a longer run would log it."""
         if row["episode"] <= self.config.episodes:
             self._successes.append(row["success"])
-            self.logger.log_train(row)
+            self.tables["train.csv"].write(row)
             self.dashboard.log_train(row)
         else:
             self._later.append(row)
@@ -403,7 +404,7 @@ class Trainer:
                 )
             ]
             for row in rows:
-                self.logger.log_eval(row)
+                self.tables["eval.csv"].write(row)
             self.dashboard.log_eval(rows)
             presented = torch.stack([snapshot.presented for snapshot in result.snapshots])
             shown = (result.success.float().mean(2).sum(0) / presented.sum(0)).tolist()
@@ -422,7 +423,7 @@ class Trainer:
             "losses": self._losses,
             "later": self._later,
             "settings": self._settings,
-            "position": self.logger.position(),
+            "position": {name: table.position() for name, table in self.tables.items()},
         }
         save_checkpoint(self.directory / "checkpoint", state)
         self._cost.measure(self._n_tasks, state["algorithm"])

@@ -96,7 +96,7 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
     try:
         digests = Digests(*(settings.pop(name, None) for name in Digests._fields))
         modules = settings.pop("task_modules", {})
-        settings.pop("scene_version", None)  # `check_settings` compares it
+        settings.pop("scene_version", None)  # `load_last` compares it
         kind = _algorithm_config(settings.get("name"), settings.pop("algorithm_class", None))
         scene = settings.get("scene", "nico")
         if scene not in SCENES:
