@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from bgpo_trl.analysis import statistics
 from bgpo_trl.analysis.comparison import Setting
@@ -31,6 +31,8 @@ from bgpo_trl.runs.results import Run
 
 Table = list[list[str]]
 """Rows of cells; the first row holds the column names."""
+Figures = dict[str, tuple[str, Figure]]
+"""File names and figures by caption."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,7 @@ class Section:
     title: str
     table: Table = field(default_factory=list)
     """Omitted if empty."""
-    figures: dict[str, Path] = field(default_factory=dict)
-    """Paths by caption."""
+    figures: Figures = field(default_factory=dict)
     notes: Sequence[str] = ()
 
 
