@@ -85,7 +85,7 @@ def show(
             tested = DemonstrationBank(
                 phi, label, torch.zeros_like(label, dtype=torch.bool), policy.tasks
             )
-            inferred[:, number] = task_inference_accuracy(algorithm.gwr, seen, tested, n_tasks)
+            inferred[:, number] = task_inference_accuracy(algorithm.gwr, seen, tested)
     measured = {"success": success, "task_inference": inferred, "activity": activity}
     columns = {name: values.flatten().numpy() for name, values in measured.items()}
     index = pd.MultiIndex.from_product([seeds, policy.tasks], names=["seed", "task"])

@@ -62,9 +62,7 @@ def measure(
     if algorithm.groups:
         held_out = bank.held_out(config.held_out)
         summary["groups"] = [len(groups.numbers) for groups in algorithm.groups]
-        summary["group_purity"] = [
-            group_purity(groups, held_out, len(config.tasks)) for groups in algorithm.groups
-        ]
+        summary["group_purity"] = [group_purity(groups, held_out) for groups in algorithm.groups]
     return summary
 
 
@@ -100,7 +98,7 @@ def _final_tests(trainer: Trainer, bank: DemonstrationBank, *, episodes: int) ->
             of_task = tested.of_task(task)
             inferred = torch.full((len(config.seeds),), torch.nan)
             if gwr is not None:
-                inferred = task_inference_accuracy(gwr, seen, of_task, len(config.tasks))
+                inferred = task_inference_accuracy(gwr, seen, of_task)
             for index, seed in enumerate(config.seeds):
                 won = success[index, task]
                 steps = result.steps[index, task][won].double().mean()  # NaN without a success
@@ -130,7 +128,7 @@ def draw(
     for name, frames in zip(file_names(config.tasks), episodes.values(), strict=True):
         save_gif(frames, out / "figures" / f"{name}.gif", fps=find_scene(config.scene).rate or 5.0)
     if summary["nodes"] is not None:
-        draw_nodes(out / "figures" / "gwr.png", trainer.algorithm, bank, config.tasks)
+        draw_nodes(out / "figures" / "gwr.png", trainer.algorithm, bank)
         inferred = np.asarray(final_means(run, "held-out", "task_inference"))
         lines.append(f"GWR-B nodes: {summary['nodes']}")
         lines.append(f"task inference on held-out demonstrations: {inferred.mean():.1%}")

@@ -92,20 +92,14 @@ def _draw_nodes(
         dots.set(label=f"{name} ({len(chosen)})", zorder=2 if number < 0 else 3)
 
 
-def draw_nodes(
-    path: Path, algorithm: Algorithm, bank: DemonstrationBank, tasks: Sequence[str]
-) -> None:
-    """Draw the nodes of the first seed's GWR-B (Fig. 7).
+def draw_nodes(path: Path, algorithm: Algorithm, bank: DemonstrationBank) -> None:
+    """Draw the nodes of the first seed's GWR-B (Fig. 7) into a PNG file.
 
-    Args:
-        path: PNG file.
-        algorithm: An algorithm with GWR-B.
-        bank: Demonstrations that define the nodes' majority tasks.
-        tasks: Names of the tasks.
+    The demonstrations seen in training define the nodes' majority tasks.
     """
     assert algorithm.gwr is not None
     weights, groups = algorithm.gwr.graph(0).weights, None
-    node_tasks = majority_task(match_counts(algorithm.gwr, bank.seen(), len(tasks))[0])
+    node_tasks = majority_task(match_counts(algorithm.gwr, bank.seen())[0])
     if algorithm.groups:
         groups = algorithm.groups[0].lookup(weights).group
-    save_figure(plot_gwr_pca(weights, node_tasks[: len(weights)], tasks, groups), path)
+    save_figure(plot_gwr_pca(weights, node_tasks[: len(weights)], bank.tasks, groups), path)
