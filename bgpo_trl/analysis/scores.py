@@ -233,9 +233,7 @@ def forward_transfer(run: Run, reference: Run) -> Estimate | None:
     left = 1 - height
     if (left == 0).any():
         return None
-    gained = contrast(
-        [(ours / left).mean(-1), (theirs * (1 - area) / left**2).mean(-1)], [1.0, -1.0]
-    )
+    gained = contrast((ours / left).mean(-1), (theirs * (1 - area) / left**2).mean(-1))
     # Not the difference of the contributions, but it has their interval.
     shift = float(((area - height) / left).mean()) - gained.value
     return Estimate(*(bound + shift for bound in gained))
