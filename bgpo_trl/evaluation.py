@@ -113,10 +113,7 @@ class Evaluator:
         self._waiting: list[list[Snapshot]] = [[] for _ in seeds]
 
     def take(self, algorithm: Algorithm, index: int, episode: int, env_steps: int) -> None:
-        """Queue a snapshot of the seed at position ``index`` for its next evaluation.
-
-        ``episode`` and ``env_steps`` count the seed's training episodes and steps so far.
-        """
+        """Queue a `snapshot` for the next evaluation of the seed at position ``index``."""
         number = self._next + len(self._waiting[index])
         snapshot = self.snapshot(algorithm, index, number, episode=episode, env_steps=env_steps)
         self._waiting[index].append(snapshot)
@@ -124,7 +121,7 @@ class Evaluator:
     def snapshot(
         self, algorithm: Algorithm, index: int, number: int, *, episode: int, env_steps: int = 0
     ) -> Snapshot:
-        """Return a seed's snapshot for evaluation ``number``; other arguments as for `take`.
+        """Return a `Snapshot` of the seed at position ``index``.
 
         Raises:
             TypeError: If the algorithm returns no `Policy`, or one for other test episodes.
@@ -253,14 +250,9 @@ def evaluator_of(
     starts: tuple[int, ...] | None = None,
     scene: Scene | None = None,
 ) -> Evaluator:
-    """Return an evaluator of the tasks of a run.
+    """Return an evaluator of the tasks of a run, which shows demonstrations of ``bank``.
 
-    Args:
-        run: The run.
-        bank: Demonstrations to show.
-        episodes: Test episodes of each task and seed.
-        starts: Episode from which each task is presented; by default all are.
-        scene: Robot to test, that of the run if None.
+    Each task is tested from its start on, by default from 0; the robot is the run's by default.
     """
     config = run.config
     return Evaluator(
@@ -284,11 +276,7 @@ def snapshots_of(run: _Run, evaluator: Evaluator, number: int) -> list[Snapshot]
 
 
 def start_seeds(seed: int, number: int, shape: Sequence[int]) -> NDArray[np.int64]:
-    """Return the seeds of the start states of a seed's evaluation ``number``, of that shape.
-
-    The shape of an `Evaluator` is tasks by test episodes; a simulation with one of these seeds
-    starts like the test episode.
-    """
+    """Return seeds of the starts of a seed's evaluation ``number``, of ``shape`` ``[T, M]``."""
     return _rng(seed, number).integers(2**32, size=tuple(shape))
 
 

@@ -70,10 +70,6 @@ class LoadedRun:
     """All seeds of a run, as left by its last checkpoint. It can be pickled, without a replay.
 
     Attributes:
-        config: The run.
-        algorithm: The algorithm of all seeds.
-        encoders: The run's encoders.
-        bank: The run's demonstrations, embedded.
         episodes: Training episodes of each seed so far.
     """
 
@@ -119,10 +115,6 @@ class TrainedPolicy:
 
     It can be pickled, for worker processes. An algorithm of one's own has to take the arguments of
     `Algorithm` alone for that.
-
-    Args:
-        run: The run.
-        seed: One of its seeds.
     """
 
     def __init__(self, run: LoadedRun, seed: int) -> None:

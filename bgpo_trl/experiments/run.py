@@ -54,15 +54,11 @@ def concurrent(arguments: Arguments) -> str:
 def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
     """Train to the end, run the final tests and draw the figures.
 
-    In addition to the files of `Trainer`, the run directory gets ``final.csv`` (success and steps
-    of the trained policies with demonstrations seen in training and with held-out ones, and task
-    inference), ``figures/`` (including a video of a test episode of each task) and finally
-    ``summary.json`` (commit, versions of packages, changed hyperparameters, command, success of a
-    random policy, nodes of GWR-B, groups of behaviors).
+    In addition to the files of `Trainer`, the run directory gets ``final.csv``, ``figures/`` and
+    finally ``summary.json``, the mark of a complete run (docs/design.md).
 
     Raises:
-        ValueError: If the directory holds another run, or no run to resume; or if ``bank`` or
-            ``encoders`` are given although encoders are yet to be trained.
+        ValueError: If arguments do not go together, or the directory holds another run.
         BlockingIOError: If another process is using the directory.
     """
     _check(arguments, config)
@@ -116,7 +112,6 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
             changed = changed_hyperparameters(config)
             summary = {**code, "changed": changed, **measure(trainer, bank, out)}
             lines = draw(trainer, bank, out, summary)
-            # Written last, as the mark of a complete run.
             write_json(out / "summary.json", summary)
     lines += [verdict] if verdict else []
     if arguments.train_encoders:
@@ -218,13 +213,8 @@ def pretrained_for(
 ) -> tuple[Representation, DemonstrationBank]:
     """Load trained encoders and the demonstrations of some tasks.
 
-    Args:
-        tasks: Names of the tasks.
-        bank: Bank to take them from; those that it lacks are taken from the one beside the
-            encoders.
-        scene: The robot, or its name.
-        weights: File of the encoders; by default those that come with the scene, for the bank if
-            there is one.
+    Those that ``bank`` lacks are taken from the bank beside the encoders. By default, the file
+    ``weights`` of the encoders is the one of the bank or, without a bank, of the scene.
 
     Raises:
         ValueError: If a file is missing, damaged or of other encoders, no encoders come with the

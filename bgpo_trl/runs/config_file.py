@@ -121,11 +121,7 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
 
 
 def read_encoder_settings(path: Path, defaults: RepresentationConfig) -> RepresentationConfig:
-    """Read settings of encoders from a file that `read_settings` reads.
-
-    Args:
-        path: The file, such as one of ``vae: {steps: 2000}``.
-        defaults: Settings that the file may lack.
+    """Read settings of encoders, such as ``vae: {steps: 2000}``; the file may lack ``defaults``.
 
     Raises:
         ValueError: If the file is missing or damaged, or holds a setting unknown or out of range.
@@ -173,15 +169,10 @@ def _merged(defaults: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any
 
 
 def _algorithm_config(name: Any, stored: Any) -> type[AlgorithmConfig]:
-    """Return the class of an algorithm's hyperparameters.
+    """Return the class of an algorithm's hyperparameters: ``stored``, if it is imported.
 
-    Args:
-        name: Of the algorithm.
-        stored: Its name in the file; None in files without it. Only classes of modules that this
-            process has imported are found, since a file should not decide what is imported.
-
-    Raises:
-        LookupError: If it is unknown.
+    A file should not decide what is imported. Without that class, it is the class of the algorithm
+    ``name``; raise ``LookupError`` if there is none.
     """
     module, _, attribute = str(stored).rpartition(".")
     kind = getattr(sys.modules.get(module), attribute, None)

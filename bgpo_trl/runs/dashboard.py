@@ -79,24 +79,14 @@ class Dashboard:
             self._episodes.append(row)
 
     def log_eval(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Log an evaluation and the training episodes before it.
-
-        Args:
-            rows: Test episodes of all seeds after the same number of training episodes, as rows of
-                ``eval.csv``.
-        """
+        """Log an evaluation of all seeds, rows of ``eval.csv``, and the training before it."""
         tests, episode = pd.DataFrame([*rows]), int(rows[0]["episode"])
         played = [row for row in self._episodes if row["episode"] <= episode]
         self._episodes = [row for row in self._episodes if row["episode"] > episode]
         self._log({**_success("eval", tests), **_training(played)}, episode)
 
     def log_final(self, tests: pd.DataFrame, episode: int) -> None:
-        """Log the tests after training.
-
-        Args:
-            tests: ``task`` and ``success`` of each seed and task, as in ``final.csv``.
-            episode: Training episodes of a seed.
-        """
+        """Log tests after the training ``episode``, rows of ``final.csv``."""
         self._log(_success("final", tests), episode)
 
     def close(self) -> None:
@@ -123,15 +113,12 @@ class Dashboard:
 
 
 def wandb_logger(
-    directory: str | os.PathLike[str], mode: Literal["online", "offline"], group: str | None = None
+    directory: str | os.PathLike[str], mode: Literal["online", "offline"], group: str
 ) -> WandbLogger:
-    """Start a run on Weights & Biases, or continue that of a run.
+    """Start a run of a group on Weights & Biases, or continue that of a run directory.
 
-    Args:
-        directory: The run directory; its ``wandb/`` gets the files, and the id of the run, by which
-            a resumed run continues its curves.
-        mode: ``"online"``, or ``"offline"`` for a later ``wandb sync``.
-        group: Group of the run.
+    The files go to its ``wandb/``, as does the id by which a resumed run continues its curves.
+    Those of the mode ``"offline"`` are for a later ``wandb sync``.
     """
     directory = Path(directory)
     identity = directory / "wandb" / "run_id"

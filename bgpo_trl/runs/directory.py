@@ -76,7 +76,7 @@ def read_checkpoint(
 
 @contextlib.contextmanager
 def fitting_checkpoint(directory: Path) -> Iterator[None]:
-    """Turn errors of loading a checkpoint's state, in the block, into one line."""
+    """Turn errors of loading a checkpoint's state in the block into one line."""
     try:
         yield
     except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
@@ -125,7 +125,7 @@ def _as_grown(saved: Mapping[str, Any], settings: Mapping[str, Any]) -> Mapping[
 
     Demonstrations of further tasks change the digest of the bank, which `Trainer` checks.
     """
-    grown = {}
+    grown = dict(saved)
     if type(saved.get("episodes")) is type(settings.get("episodes")) is int:
         grown["episodes"] = max(saved["episodes"], settings["episodes"])
     of_tasks = ("tasks", "task_starts")
@@ -135,7 +135,7 @@ def _as_grown(saved: Mapping[str, Any], settings: Mapping[str, Any]) -> Mapping[
         for old, new in lists
     ):
         grown |= {name: settings.get(name) for name in (*of_tasks, "bank")}
-    return {**saved, **grown}
+    return grown
 
 
 def flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
