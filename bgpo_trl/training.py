@@ -21,7 +21,7 @@ from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.logged_episodes import LoggedEpisodes
 from bgpo_trl.encoders.representation import Representation, check_savable
-from bgpo_trl.evaluation import Evaluator, evaluator_of
+from bgpo_trl.evaluation import Evaluator
 from bgpo_trl.files.checkpoint import save_checkpoint
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.writing import lock_directory
@@ -201,8 +201,12 @@ class Trainer:
         self.evaluator: Evaluator | None = None
         if config.eval_episodes:
             tested = bank.held_out(config.held_out)
-            self.evaluator = evaluator_of(
-                self, tested, config.eval_episodes, starts=config.task_starts
+            self.evaluator = Evaluator(
+                config,
+                tested,
+                self.encoders,
+                episodes=config.eval_episodes,
+                starts=config.task_starts,
             )
 
     def _check_added_tasks(self, saved: dict[str, Any], bank: DemonstrationBank) -> None:

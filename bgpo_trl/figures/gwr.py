@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
-from bgpo_trl.algorithms import Algorithm
-from bgpo_trl.analysis.task_inference import majority_task, match_counts
-from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.figures.style import MARKERS, add_legend, save_figure, style_axes, task_markers
+from bgpo_trl.figures.style import MARKERS, add_legend, style_axes, task_markers
 
 _NO_TASK = (-1, "no demonstration", "0.6", "x")
 # Paul Tol's muted colors, for groups, so that they are not taken for tasks.
@@ -90,16 +86,3 @@ def _draw_nodes(
         if marker != "x":
             dots.set(edgecolors="w")
         dots.set(label=f"{name} ({len(chosen)})", zorder=2 if number < 0 else 3)
-
-
-def draw_nodes(path: Path, algorithm: Algorithm, bank: DemonstrationBank) -> None:
-    """Draw the nodes of the first seed's GWR-B (Fig. 7) into a PNG file.
-
-    The demonstrations seen in training define the nodes' majority tasks.
-    """
-    assert algorithm.gwr is not None
-    weights, groups = algorithm.gwr.graph(0).weights, None
-    node_tasks = majority_task(match_counts(algorithm.gwr, bank.seen())[0])
-    if algorithm.groups:
-        groups = algorithm.groups[0].lookup(weights).group
-    save_figure(plot_gwr_pca(weights, node_tasks[: len(weights)], bank.tasks, groups), path)
