@@ -45,7 +45,7 @@ def run_config(
             raise ValueError("--add-task: a task that comes later is for `bgpo continual`")
         if any(config.task_starts) and (arguments.gives("task_starts") or "task_starts" in given):
             raise ValueError("--task-starts: all tasks are presented from the start here")
-        config = at_once(config)
+        config = replace(config, task_starts=(0,) * len(config.tasks))
     if config.eval_every > config.episodes:
         raise ValueError(
             f"eval_every must be at most the {config.episodes} episodes of the run, got "
@@ -121,11 +121,6 @@ def chosen_tasks(tasks: tuple[str, ...] | None, scene: Scene) -> tuple[str, ...]
     tasks = scene.all_tasks if tasks == ("all",) else tasks
     scene.check_tasks(tasks)
     return tasks
-
-
-def at_once(config: RunConfig) -> RunConfig:
-    """Return a run whose tasks are all presented from the start."""
-    return replace(config, task_starts=(0,) * len(config.tasks))
 
 
 def even_starts(n_tasks: int, episodes: int) -> tuple[int, ...]:

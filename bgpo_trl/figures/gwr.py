@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
-from bgpo_trl.figures.style import MARKERS, add_legend, style_axes, task_markers
+from bgpo_trl.figures.style import add_legend, markers, style_axes, task_markers
 
 _NO_TASK = (-1, "no demonstration", "0.6", "x")
 # Paul Tol's muted colors, for groups, so that they are not taken for tasks.
@@ -34,7 +34,8 @@ def plot_gwr_pca(
     points, share = _principal_components(np.asarray(weights, dtype=np.float64))
     panels = [(np.asarray(node_task), [*task_markers(task_names), _NO_TASK])]
     if node_group is not None:
-        panels.append((np.asarray(node_group), _group_markers(node_group)))
+        names = {group: f"group {group}" for group in np.unique(node_group).tolist()}
+        panels.append((np.asarray(node_group), markers(names, _GROUP_COLORS)))
     width = 4.8
     figure = Figure(figsize=(width * len(panels), 4.6), layout="constrained")
     all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
@@ -58,19 +59,6 @@ def _principal_components(values: NDArray) -> tuple[NDArray, NDArray]:
     directions = directions * np.sign(np.take_along_axis(directions, largest, axis=1))
     share = scales[:2] ** 2 / max((scales**2).sum(), np.finfo(float).tiny)
     return centered @ directions[:2].T, share
-
-
-def _group_markers(groups: ArrayLike) -> list[tuple[int, str, str, str]]:
-    """Return number, legend name, color and marker of each group."""
-    return [
-        (
-            group,
-            f"group {group}",
-            _GROUP_COLORS[group % len(_GROUP_COLORS)],
-            MARKERS[group % len(MARKERS)],
-        )
-        for group in np.unique(groups).tolist()
-    ]
 
 
 def _draw_nodes(
