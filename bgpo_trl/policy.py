@@ -366,11 +366,9 @@ def _check_onnx() -> None:
 
 def _onnx_model(program: torch.export.ExportedProgram, about: str) -> bytes:
     """Return a program as an ONNX model, with ``about`` as its metadata ``bgpo_trl.json``."""
-    logs = [logging.getLogger(name) for name in ("onnxscript", "torch.onnx")]
-    levels = [log.level for log in logs]
+    disabled = logging.root.manager.disable
     try:
-        for log in logs:
-            log.setLevel(logging.ERROR)  # They report what they leave as it is.
+        logging.disable(logging.WARNING)  # onnxscript reports what it leaves as it is.
         with warnings.catch_warnings(action="ignore", category=FutureWarning):
             made = torch.onnx.export(
                 program,
@@ -380,8 +378,7 @@ def _onnx_model(program: torch.export.ExportedProgram, about: str) -> bytes:
                 output_names=["action"],
             )
     finally:
-        for log, level in zip(logs, levels, strict=True):
-            log.setLevel(level)
+        logging.disable(disabled)
     assert made is not None
     model: Any = made.model_proto
     model.metadata_props.add(key="bgpo_trl.json", value=about)

@@ -168,7 +168,7 @@ class Trainer:
             if saved is None and encoders is not None:
                 keep_inputs(self.directory, bank, encoders, self._scene)
             self.dashboard = Dashboard(self.directory, loggers, settings=self._settings)
-            opened.enter_context(self.dashboard)
+            opened.callback(self.dashboard.close)
             for row in () if saved is None else saved["later"]:
                 self._log(row)
             self._opened = opened.pop_all()
@@ -283,7 +283,8 @@ class Trainer:
                         self._end_of_episode(index, transition)
                         self._begin_tasks(index)
                         if before[index] < n_episodes:
-                            bar.set_postfix_str(self._success_so_far(), refresh=False)
+                            rate = sum(self._successes) / len(self._successes)
+                            bar.set_postfix_str(f"success {rate:.2f}{self._tested}", refresh=False)
                             bar.update()
                     self._evaluate()
                     late = time.monotonic() - saved > 60 * self.config.checkpoint_minutes
@@ -335,10 +336,6 @@ class Trainer:
     def _n_tasks(self) -> int:
         """Number of tasks that are presented to all seeds."""
         return int(self._schedule.presented(self.world.source.episode + 1).sum(-1).min())
-
-    def _success_so_far(self) -> str:
-        rate = sum(self._successes) / len(self._successes)
-        return f"success {rate:.2f}{self._tested}"
 
     def _end_of_episode(self, index: int, transition: TensorDictBase) -> None:
         algorithm, end = self.algorithm, transition.get("next")[index]

@@ -97,11 +97,7 @@ def write_sections(sections: Sequence[Section], out: Path) -> str:
 
 
 def report(arguments: ReportArguments) -> str:
-    """Write the report that `ReportArguments` describes; return its tables.
-
-    Raises:
-        ValueError: If a run is damaged, none is finished, or conditions differ.
-    """
+    """Write the report that `ReportArguments` describes; return its tables."""
     named = list(arguments.runs)
     if not named:
         raise ValueError("name a run, or a folder of runs")

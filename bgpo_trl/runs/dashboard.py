@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import pandas as pd
 from torchrl.record.loggers.common import Logger
@@ -93,12 +93,6 @@ class Dashboard:
         """Shut the loggers down."""
         self._each(lambda logger: logger.shutdown())
         self._loggers = []
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _log(self, metrics: Mapping[str, float], episode: int) -> None:
         self._each(lambda logger: logger.log_metrics(dict(metrics), step=episode))

@@ -1,5 +1,6 @@
 """Means on dashboards, against means computed by hand; loggers that fail or are missing."""
 
+import contextlib
 import sys
 import types
 
@@ -61,7 +62,7 @@ def make(tmp_path):
             for row in tested:
                 kept = ("seed", "episode", "task", "success")
                 tables["eval.csv"].write({name: row[name] for name in kept})
-        return Dashboard(tmp_path, loggers, settings=SETTINGS)
+        return contextlib.closing(Dashboard(tmp_path, loggers, settings=SETTINGS))
 
     return make
 
