@@ -1,6 +1,6 @@
 """Sections of a report: success, differences, forgetting and transfer, learning times, groups.
 
-A function of a section returns a list, which is empty where no run has what the section is about.
+Sections that not every setting has come as a list, which may be empty.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _PAIRS = {
 }
 
 
-def success_section(setting: Setting) -> list[Section]:
+def success_section(setting: Setting) -> Section:
     """Return the conditions of a setting, and the success of its runs."""
     first = setting.first
     conditions = {name: first.config.get(name) for name in ("held_out", "eval_episodes")}
@@ -91,7 +91,7 @@ def success_section(setting: Setting) -> list[Section]:
         solved = ~np.isnan(steps)
         row += [_mean_cell(steps[solved]), _mean_cell(demonstrated[solved])]
         rows.append([*row, statistics.mean(area.mean(1)).percent()])
-    return [Section(setting.title, rows, notes=notes)]
+    return Section(setting.title, rows, notes=notes)
 
 
 def _mean_cell(steps: Values) -> str:
@@ -141,7 +141,7 @@ def difference_section(setting: Setting) -> list[Section]:
     return [Section(f"Differences: {setting.title}", rows, notes=notes)] if pairs else []
 
 
-def sequence_section(setting: Setting, reference: Setting | None) -> list[Section]:
+def sequence_section(setting: Setting, reference: Setting | None) -> Section:
     """Return forgetting and transfer in a setting with tasks one after the other."""
     rows = [["", "forgetting", "forward transfer"]]
     for name, run in setting.runs.items():
@@ -157,7 +157,7 @@ def sequence_section(setting: Setting, reference: Setting | None) -> list[Sectio
         "its own episodes, from the first to the last test of its phase; reference: the same "
         "algorithm with all tasks from the start, whose seeds count in the interval.",
     )
-    return [Section(f"Forgetting and transfer: {setting.title}", rows, notes=notes)]
+    return Section(f"Forgetting and transfer: {setting.title}", rows, notes=notes)
 
 
 def speed_section(setting: Setting, share: float) -> list[Section]:

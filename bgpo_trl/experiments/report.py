@@ -57,11 +57,11 @@ def curves_of(setting: Setting) -> Figures:
 
 def setting_sections(setting: Setting, reference: Setting | None) -> list[Section]:
     """Return the sections of a setting, with their figures."""
-    (success,) = success_section(setting)
-    sections = [replace(success, figures=curves_of(setting)), *difference_section(setting)]
+    success = replace(success_section(setting), figures=curves_of(setting))
+    sections = [success, *difference_section(setting)]
     if setting.in_sequence:
         try:
-            (found,) = sequence_section(setting, reference)
+            found = sequence_section(setting, reference)
             matrices = {name: success_matrix(run).mean(0) for name, run in setting.runs.items()}
             figure = plot_success_matrices(matrices, setting.first.tasks)
             drawn = {
