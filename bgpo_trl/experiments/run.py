@@ -69,15 +69,15 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
     size = arguments.preset or (arguments.config.stem if arguments.config else "quick")
     group = f"{name}-{config.name}"
     out = named_directory(arguments) or Path("runs") / f"{group}-{size}"
-    begun: tuple[RunConfig, Digests] | None = None
+    digests: Digests | None = None
     grown: Grown | None = None
     verdict = ""
     if not arguments.resume and holds_run(out):
         raise ValueError(f"{out} holds a run: --resume continues it, --out names another directory")
     if arguments.resume and (out / "config.json").exists():
-        begun = read_config(out / "config.json")
-        config = _continued(arguments, config, begun[0])
-        if arguments.add_task is None and _is_finished(out, config, begun[0]):
+        saved, digests = read_config(out / "config.json")
+        config = _continued(arguments, config, saved)
+        if arguments.add_task is None and _is_finished(out, config, saved):
             return f"{out} is finished, all {config.episodes} episodes: --episodes makes it longer"
     loggers: list[Callable[[], Logger]] = []
     if arguments.wandb is not None:
@@ -94,7 +94,7 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
             warnings.warn(verdict, stacklevel=2)
     with lock_directory(out):
         if grown is None:
-            encoders, bank = _inputs(arguments, config, out, device, begun)
+            encoders, bank = _inputs(arguments, config, out, device, digests)
         else:
             encoders, bank = grown.encoders, grown.bank
         with Trainer(
@@ -171,12 +171,12 @@ def _inputs(
     config: RunConfig,
     out: Path,
     device: torch.device,
-    begun: tuple[RunConfig, Digests] | None,
+    digests: Digests | None,
 ) -> tuple[Representation, DemonstrationBank]:
-    """Return the pretrained encoders and a bank, or new ones made in the run directory."""
+    """Return encoders and a bank: those of a run that has begun, trained ones, or new ones."""
     scene, bank = find_scene(config.scene), arguments.bank
-    if begun is not None and bank is None:
-        return load_inputs(out, config.tasks, begun[1], scene)
+    if digests is not None and bank is None:
+        return load_inputs(out, config.tasks, digests, scene)
     # A bank fits only the encoders that embedded it.
     given = arguments.encoders is not None or bank is not None
     stage = STAGE_PRESETS.get(arguments.preset or "", {})
