@@ -13,7 +13,7 @@ from bgpo_trl.algorithms import ALGORITHMS, entry
 from bgpo_trl.configs import PRESETS, RunConfig
 from bgpo_trl.configs.runs import check_seeds
 from bgpo_trl.experiments.arguments import SETTINGS, Arguments
-from bgpo_trl.runs.config_file import read_config, read_settings
+from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.directory import differing_settings
 from bgpo_trl.scenes import Scene, find_scene
 
@@ -66,10 +66,6 @@ def _begin(arguments: Arguments) -> RunConfig:
     path = path / "config.json" if path.is_dir() else path
     if not path.exists():
         raise ValueError(f"--config: there is no file {path}: name one, or a run directory")
-    settings = read_settings(path)
-    name = settings.get("name", preset.name)
-    if isinstance(name, str) and name in ALGORITHMS:
-        preset = replace(preset, name=name, algorithm=ALGORITHMS[name].config)
     return read_config(path, defaults=preset)[0]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict, is_dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_type_hints
 
@@ -51,13 +51,8 @@ _Loader.add_implicit_resolver(
 )
 
 
-def read_settings(path: Path) -> dict[str, Any]:
-    """Return the entries of a file of settings, YAML or JSON, which is YAML too.
-
-    Raises:
-        ValueError: If the file is missing or damaged, gives a key twice, or is no mapping of names
-            to values.
-    """
+def _read_settings(path: Path) -> dict[str, Any]:
+    """Return the entries of a file of settings, YAML or JSON, which is YAML too."""
     try:
         found = yaml.load(path.read_text(), Loader=_Loader)
     except FileNotFoundError:
@@ -78,9 +73,9 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
     """Read the settings that `Trainer` wrote: the inverse of ``dataclasses.asdict``.
 
     Args:
-        path: The ``config.json`` of a run, or another file that `read_settings` reads.
-        defaults: Settings that the file may lack, also all of the algorithm; by default, those of
-            the classes.
+        path: The ``config.json`` of a run, or another file of settings, YAML or JSON.
+        defaults: Settings that the file may lack, with the usual ones of the algorithm that the
+            file names; by default, those of the classes.
 
     Returns:
         The settings, and the digests of the encoders and demonstrations.
@@ -90,8 +85,11 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
             names a task or hyperparameters that this process does not know.
     """
     path = Path(path)
-    settings = read_settings(path)
+    settings = _read_settings(path)
     if defaults is not None:
+        name = settings.get("name", defaults.name)
+        if isinstance(name, str) and name in ALGORITHMS:
+            defaults = replace(defaults, name=name, algorithm=ALGORITHMS[name].config)
         settings = _merged(_as_json(asdict(defaults)), settings)
     try:
         digests = Digests(*(settings.pop(name, None) for name in Digests._fields))
@@ -128,7 +126,7 @@ def read_encoder_settings(path: Path, defaults: RepresentationConfig) -> Represe
     """
     if not path.is_file():
         raise ValueError(f"there is no file of settings {path}")
-    settings = _merged(_as_json(asdict(defaults)), read_settings(path))
+    settings = _merged(_as_json(asdict(defaults)), _read_settings(path))
     try:
         return _built(RepresentationConfig, settings)
     except ValueError as error:
