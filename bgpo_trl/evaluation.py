@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor
 from bgpo_trl.algorithms import Algorithm
 from bgpo_trl.algorithms.algorithm import Policy, read_joints
 from bgpo_trl.algorithms.environments import observation_env
-from bgpo_trl.configs import AlgorithmConfig
+from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.scenes import Scene, find_scene
@@ -66,9 +66,13 @@ class Evaluator:
     test episodes run side by side. Start states and demonstrations depend only on the seed and the
     number of the evaluation.
 
-    Config, seeds, schedule and encoders are those of training; the bank has held-out
-    demonstrations. ``spread`` is the share of the whole range of start states. Each task is tested
-    in ``episodes`` episodes.
+    Args:
+        config: The run.
+        bank: Demonstrations to show in tests.
+        encoders: The run's encoders.
+        episodes: Test episodes of each task and seed.
+        starts: Episode from which each task is tested; by default 0.
+        scene: Robot to test; that of the run by default.
 
     Raises:
         ValueError: If a task has no demonstration.
@@ -76,22 +80,18 @@ class Evaluator:
 
     def __init__(
         self,
-        config: AlgorithmConfig,
-        *,
-        seeds: Sequence[int],
-        schedule: TaskSchedule,
-        episodes: int,
+        config: RunConfig,
         bank: DemonstrationBank,
         encoders: Representation | None,
-        spread: float = 1.0,
-        scene: Scene | str = "nico",
+        *,
+        episodes: int,
+        starts: tuple[int, ...] | None = None,
+        scene: Scene | None = None,
     ) -> None:
-        scene = find_scene(scene)
-        self.max_steps = config.max_steps
-        self._state_key = config.observed
-        self.seeds, self.schedule = tuple(seeds), schedule
-        n_tasks = schedule.n_tasks
-        self.shape = (len(seeds), n_tasks, episodes)
+        scene = find_scene(config.scene if scene is None else scene)
+        self.config, learner, n_tasks = config, config.algorithm, len(config.tasks)
+        self.schedule = TaskSchedule((0,) * n_tasks if starts is None else starts)
+        self.shape = (len(config.seeds), n_tasks, episodes)
         self._rows_of = [torch.nonzero(bank.task == task).flatten() for task in range(n_tasks)]
         missing = [task for task, rows in enumerate(self._rows_of) if not len(rows)]
         if missing:
@@ -103,20 +103,17 @@ class Evaluator:
         self.simulation = scene.simulate(
             bank.tasks,
             batch_size=self.shape,
-            spread=spread,
-            observation="pixels" if config.state == "latent" else "state",
+            spread=config.spread,
+            observation="pixels" if learner.state == "latent" else "state",
         )
-        joints = read_joints(config, scene)
-        self.env = observation_env(config, self.simulation, encoders, scene.state, joints)
+        joints = read_joints(learner, scene)
+        self.env = observation_env(learner, self.simulation, encoders, scene.state, joints)
         self._task = torch.arange(n_tasks)[:, None].expand(self.shape).contiguous()
         self._next = 0
-        self._waiting: list[list[Snapshot]] = [[] for _ in seeds]
+        self._waiting: list[list[Snapshot]] = [[] for _ in config.seeds]
 
     def take(self, algorithm: Algorithm, index: int, episode: int, env_steps: int) -> None:
-        """Queue a snapshot of the seed at position ``index`` for its next evaluation.
-
-        ``episode`` and ``env_steps`` count the seed's training episodes and steps so far.
-        """
+        """Queue a `snapshot` for the next evaluation of the seed at position ``index``."""
         number = self._next + len(self._waiting[index])
         snapshot = self.snapshot(algorithm, index, number, episode=episode, env_steps=env_steps)
         self._waiting[index].append(snapshot)
@@ -124,12 +121,12 @@ class Evaluator:
     def snapshot(
         self, algorithm: Algorithm, index: int, number: int, *, episode: int, env_steps: int = 0
     ) -> Snapshot:
-        """Return a seed's snapshot for evaluation ``number``; other arguments as for `take`.
+        """Return a `Snapshot` of the seed at position ``index``.
 
         Raises:
             TypeError: If the algorithm returns no `Policy`, or one for other test episodes.
         """
-        rng = _rng(self.seeds[index], number)
+        rng = _rng(self.config.seeds[index], number)
         drawn = torch.stack(
             [
                 rows[torch.from_numpy(rng.integers(len(rows), size=self.shape[2]))]
@@ -159,6 +156,11 @@ class Evaluator:
             policy=policy,
         )
 
+    def snapshots(self, algorithm: Algorithm, number: int) -> list[Snapshot]:
+        """Return the trained policy of each seed, conditioned for evaluation ``number``."""
+        episode, n_seeds = self.config.episodes, len(self.config.seeds)
+        return [self.snapshot(algorithm, i, number, episode=episode) for i in range(n_seeds)]
+
     def run_next(self, device: torch.device | str = "cpu") -> TestResult | None:
         """Run the next evaluation if all seeds have queued a snapshot."""
         if not all(self._waiting):
@@ -181,7 +183,7 @@ class Evaluator:
         policies = [snapshot.policy.to(device) for snapshot in snapshots]
         starts = [
             start_seeds(seed, snapshot.number, self.shape[1:])
-            for seed, snapshot in zip(self.seeds, snapshots, strict=True)
+            for seed, snapshot in zip(self.config.seeds, snapshots, strict=True)
         ]
         self.simulation.seed_rows(np.stack(starts).ravel().tolist())
         presented = torch.stack([s.presented for s in snapshots])
@@ -191,8 +193,8 @@ class Evaluator:
         start = {"task": self._task, "_reset": active.unsqueeze(-1)}
         state = self.env.reset(TensorDict(start, self.shape))
         watch()
-        for _ in range(self.max_steps):
-            seen = state[self._state_key].to(device)
+        for _ in range(self.config.algorithm.max_steps):
+            seen = state[self.config.algorithm.observed].to(device)
             actions = [policy.act(of_seed) for policy, of_seed in zip(policies, seen, strict=True)]
             state.set("action", torch.stack(actions).cpu())
             state.set("_step", active)
@@ -237,58 +239,8 @@ class Evaluator:
         return Snapshot(**{**saved, "presented": presented, "policy": algorithm.policy(**policy)})
 
 
-class _Run(Protocol):
-    """A `Trainer`, a `LoadedRun` or a `TrainedPolicy`."""
-
-    config: Any
-    encoders: Any
-    algorithm: Any
-
-
-def evaluator_of(
-    run: _Run,
-    bank: DemonstrationBank,
-    episodes: int,
-    *,
-    starts: tuple[int, ...] | None = None,
-    scene: Scene | None = None,
-) -> Evaluator:
-    """Return an evaluator of the tasks of a run.
-
-    Args:
-        run: The run.
-        bank: Demonstrations to show.
-        episodes: Test episodes of each task and seed.
-        starts: Episode from which each task is presented; by default all are.
-        scene: Robot to test, that of the run if None.
-    """
-    config = run.config
-    return Evaluator(
-        config.algorithm,
-        seeds=config.seeds,
-        schedule=TaskSchedule((0,) * len(config.tasks) if starts is None else starts),
-        episodes=episodes,
-        bank=bank,
-        encoders=run.encoders,
-        spread=config.spread,
-        scene=config.scene if scene is None else scene,
-    )
-
-
-def snapshots_of(run: _Run, evaluator: Evaluator, number: int) -> list[Snapshot]:
-    """Return the trained policy of each seed, conditioned for evaluation ``number``."""
-    return [
-        evaluator.snapshot(run.algorithm, index, number, episode=run.config.episodes)
-        for index in range(len(run.config.seeds))
-    ]
-
-
 def start_seeds(seed: int, number: int, shape: Sequence[int]) -> NDArray[np.int64]:
-    """Return the seeds of the start states of a seed's evaluation ``number``, of that shape.
-
-    The shape of an `Evaluator` is tasks by test episodes; a simulation with one of these seeds
-    starts like the test episode.
-    """
+    """Return seeds of the starts of a seed's evaluation ``number``, of ``shape`` ``[T, M]``."""
     return _rng(seed, number).integers(2**32, size=tuple(shape))
 
 

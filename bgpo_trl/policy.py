@@ -70,10 +70,6 @@ class LoadedRun:
     """All seeds of a run, as left by its last checkpoint. It can be pickled, without a replay.
 
     Attributes:
-        config: The run.
-        algorithm: The algorithm of all seeds.
-        encoders: The run's encoders.
-        bank: The run's demonstrations, embedded.
         episodes: Training episodes of each seed so far.
     """
 
@@ -119,10 +115,6 @@ class TrainedPolicy:
 
     It can be pickled, for worker processes. An algorithm of one's own has to take the arguments of
     `Algorithm` alone for that.
-
-    Args:
-        run: The run.
-        seed: One of its seeds.
     """
 
     def __init__(self, run: LoadedRun, seed: int) -> None:
@@ -374,11 +366,9 @@ def _check_onnx() -> None:
 
 def _onnx_model(program: torch.export.ExportedProgram, about: str) -> bytes:
     """Return a program as an ONNX model, with ``about`` as its metadata ``bgpo_trl.json``."""
-    logs = [logging.getLogger(name) for name in ("onnxscript", "torch.onnx")]
-    levels = [log.level for log in logs]
+    disabled = logging.root.manager.disable
     try:
-        for log in logs:
-            log.setLevel(logging.ERROR)  # They report what they leave as it is.
+        logging.disable(logging.WARNING)  # onnxscript reports what it leaves as it is.
         with warnings.catch_warnings(action="ignore", category=FutureWarning):
             made = torch.onnx.export(
                 program,
@@ -388,8 +378,7 @@ def _onnx_model(program: torch.export.ExportedProgram, about: str) -> bytes:
                 output_names=["action"],
             )
     finally:
-        for log, level in zip(logs, levels, strict=True):
-            log.setLevel(level)
+        logging.disable(disabled)
     assert made is not None
     model: Any = made.model_proto
     model.metadata_props.add(key="bgpo_trl.json", value=about)

@@ -21,7 +21,7 @@ from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.logged_episodes import LoggedEpisodes
 from bgpo_trl.encoders.representation import Representation, check_savable
-from bgpo_trl.evaluation import Evaluator, evaluator_of
+from bgpo_trl.evaluation import Evaluator
 from bgpo_trl.files.checkpoint import save_checkpoint
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.writing import lock_directory
@@ -31,7 +31,7 @@ from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.cost import CostLog
 from bgpo_trl.runs.dashboard import Dashboard
 from bgpo_trl.runs.demonstrations import keep_inputs
-from bgpo_trl.runs.directory import RunLogger, digest_of_logged, fitting_checkpoint, load_last
+from bgpo_trl.runs.directory import digest_of_logged, fitting_checkpoint, load_last, open_tables
 from bgpo_trl.scenes import find_scene
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import TaskSchedule
@@ -156,18 +156,19 @@ class Trainer:
                 if encoders is not None:  # before config.json names tasks that may be added
                     keep_inputs(self.directory, bank, encoders, self._scene)
             self._cost = CostLog(self.directory / "cost.csv", resume=saved is not None)
-            self.logger = RunLogger(
-                self.directory,
-                config=self._settings,
-                logged=self.algorithm.logged,
-                position=saved["position"] if saved is not None else {} if resume else None,
+            self.tables = opened.enter_context(
+                open_tables(
+                    self.directory,
+                    config=self._settings,
+                    logged=self.algorithm.logged,
+                    position=saved["position"] if saved is not None else {} if resume else None,
+                )
             )
-            opened.enter_context(self.logger)
             # Runs without encoders cannot be loaded to watch demonstrations.
             if saved is None and encoders is not None:
                 keep_inputs(self.directory, bank, encoders, self._scene)
             self.dashboard = Dashboard(self.directory, loggers, settings=self._settings)
-            opened.enter_context(self.dashboard)
+            opened.callback(self.dashboard.close)
             for row in () if saved is None else saved["later"]:
                 self._log(row)
             self._opened = opened.pop_all()
@@ -200,8 +201,12 @@ class Trainer:
         self.evaluator: Evaluator | None = None
         if config.eval_episodes:
             tested = bank.held_out(config.held_out)
-            self.evaluator = evaluator_of(
-                self, tested, config.eval_episodes, starts=config.task_starts
+            self.evaluator = Evaluator(
+                config,
+                tested,
+                self.encoders,
+                episodes=config.eval_episodes,
+                starts=config.task_starts,
             )
 
     def _check_added_tasks(self, saved: dict[str, Any], bank: DemonstrationBank) -> None:
@@ -278,7 +283,8 @@ class Trainer:
                         self._end_of_episode(index, transition)
                         self._begin_tasks(index)
                         if before[index] < n_episodes:
-                            bar.set_postfix_str(self._success_so_far(), refresh=False)
+                            rate = sum(self._successes) / len(self._successes)
+                            bar.set_postfix_str(f"success {rate:.2f}{self._tested}", refresh=False)
                             bar.update()
                     self._evaluate()
                     late = time.monotonic() - saved > 60 * self.config.checkpoint_minutes
@@ -331,10 +337,6 @@ class Trainer:
         """Number of tasks that are presented to all seeds."""
         return int(self._schedule.presented(self.world.source.episode + 1).sum(-1).min())
 
-    def _success_so_far(self) -> str:
-        rate = sum(self._successes) / len(self._successes)
-        return f"success {rate:.2f}{self._tested}"
-
     def _end_of_episode(self, index: int, transition: TensorDictBase) -> None:
         algorithm, end = self.algorithm, transition.get("next")[index]
         episode = int(self.world.source.episode[index])
@@ -375,7 +377,7 @@ class Trainer:
         """Log an episode, or keep it if only a longer run would log it."""
         if row["episode"] <= self.config.episodes:
             self._successes.append(row["success"])
-            self.logger.log_train(row)
+            self.tables["train.csv"].write(row)
             self.dashboard.log_train(row)
         else:
             self._later.append(row)
@@ -403,7 +405,7 @@ class Trainer:
                 )
             ]
             for row in rows:
-                self.logger.log_eval(row)
+                self.tables["eval.csv"].write(row)
             self.dashboard.log_eval(rows)
             presented = torch.stack([snapshot.presented for snapshot in result.snapshots])
             shown = (result.success.float().mean(2).sum(0) / presented.sum(0)).tolist()
@@ -422,7 +424,7 @@ class Trainer:
             "losses": self._losses,
             "later": self._later,
             "settings": self._settings,
-            "position": self.logger.position(),
+            "position": {name: table.position() for name, table in self.tables.items()},
         }
         save_checkpoint(self.directory / "checkpoint", state)
         self._cost.measure(self._n_tasks, state["algorithm"])

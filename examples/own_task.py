@@ -51,5 +51,5 @@ if __name__ == "__main__":
         counts = f"{won.sum():.0f} of {len(won)} in training, {passed.sum():.0f} of {len(passed)}"
         print(f"{task}: {counts} tests")
     gwr = trainer.algorithm.gwr
-    inferred = task_inference_accuracy(gwr, bank.seen(), bank.held_out(), len(bank.tasks))
+    inferred = task_inference_accuracy(gwr, bank.seen(), bank.held_out())
     print(f"GWR-B, {gwr.num_nodes.item()} nodes: task inferred for {inferred.item():.0%}, held out")

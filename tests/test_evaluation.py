@@ -40,13 +40,12 @@ def make(bank, encoders, make_config, in_world):
         n_steps=None,
         episodes=EPISODES,
     ):
-        config = make_config(state, name).algorithm
-        parts, schedule = {"seeds": seeds, "encoders": encoders}, TaskSchedule(starts)
-        algorithm = entry(name).make(config, bank=bank.seen(), **parts)
-        in_world(algorithm, seeds, schedule)
-        evaluator = Evaluator(
-            config, schedule=schedule, episodes=episodes, bank=bank.held_out(), **parts
+        config = make_config(state, name, seeds=seeds)
+        algorithm = entry(name).make(
+            config.algorithm, seeds=seeds, bank=bank.seen(), encoders=encoders
         )
+        in_world(algorithm, seeds, TaskSchedule(starts))
+        evaluator = Evaluator(config, bank.held_out(), encoders, episodes=episodes, starts=starts)
         # Four episodes, after which all tasks are presented, take at most 24 steps.
         n_usual = next((n for start, n in STEPS.items() if name.startswith(start)), 25)
         train(algorithm, n_usual if n_steps is None else n_steps)
@@ -278,14 +277,7 @@ def test_a_bank_without_a_held_out_demonstration_of_a_task_is_refused(bank, enco
     train = bank.train | (bank.task == 1)
     incomplete = DemonstrationBank(bank.embedding, bank.task, train, bank.tasks).held_out()
     with pytest.raises(ValueError, match="no held-out demonstration of task 1"):
-        Evaluator(
-            make_config().algorithm,
-            seeds=SEEDS,
-            schedule=TaskSchedule((0, 0, 0)),
-            episodes=1,
-            bank=incomplete,
-            encoders=encoders,
-        )
+        Evaluator(make_config(), incomplete, encoders, episodes=1)
 
 
 def test_success_of_random_actions_equals_a_plain_loop(easy_world):

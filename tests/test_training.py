@@ -14,6 +14,7 @@ from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.files.checkpoint import load_checkpoint
+from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.runs.cost import n_bytes
 from bgpo_trl.runs.results import read_table
 from bgpo_trl.scenes.nico import NicoEnv
@@ -276,22 +277,21 @@ def crash(*args, **kwargs):
 
 
 @pytest.mark.parametrize(
-    ("method", "saved"),
+    ("part", "name", "saved"),
     [
-        ("algorithm.act", 11),
-        ("algorithm.update", 0),
-        ("evaluator.take", 11),
-        ("logger.log_eval", 11),
+        (lambda trainer: trainer.algorithm, "act", 11),
+        (lambda trainer: trainer.algorithm, "update", 0),
+        (lambda trainer: trainer.evaluator, "take", 11),
+        (lambda trainer: trainer.tables["eval.csv"], "write", 11),
     ],
 )
 def test_a_run_that_fails_is_resumed_from_its_last_checkpoint(
-    uninterrupted, begin, tmp_path, monkeypatch, method, saved
+    uninterrupted, begin, tmp_path, monkeypatch, part, name, saved
 ):
     """Rows written after the checkpoint are written again."""
     trainer = begin(tmp_path)
     trainer.config = replace(trainer.config, checkpoint_minutes=0.0)
-    part, name = method.split(".")
-    owner, save = getattr(trainer, part), trainer.save
+    owner, save = part(trainer), trainer.save
     intact = getattr(owner, name)
 
     def failing(*args):
@@ -481,10 +481,10 @@ def test_a_failure_to_write_the_bank_closes_the_run(begin, tmp_path, monkeypatch
         raise OSError("cannot write the bank: make room")
 
     closed = []
-    close = training.RunLogger.close
-    monkeypatch.setattr(training.RunLogger, "close", lambda log: (closed.append(1), close(log)))
+    close = CsvFile.close
+    monkeypatch.setattr(CsvFile, "close", lambda table: (closed.append(table.path), close(table)))
     monkeypatch.setattr(training, "keep_inputs", refuse)
     with pytest.raises(OSError, match="make room"):
         begin(tmp_path / "run")
-    assert closed == [1]
+    assert sorted(path.name for path in closed) == ["eval.csv", "train.csv"]
     assert not (tmp_path / "run" / "lock").exists()

@@ -30,7 +30,7 @@ from shared import (
 )
 
 from bgpo_trl.analysis.tables import Table, markdown
-from bgpo_trl.evaluation import evaluator_of, snapshots_of, start_seeds
+from bgpo_trl.evaluation import Evaluator, start_seeds
 from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.files.writing import check_folder
 from bgpo_trl.machine import set_threads
@@ -209,7 +209,8 @@ class Row(NamedTuple):
 def policy_episodes(run: LoadedRun, episodes: int) -> list[Episode]:
     """Return the test episodes of all seeds' trained policies, as many of each task and seed."""
     held_out = run.bank.held_out(run.config.held_out)
-    evaluator, first = evaluator_of(run, held_out, episodes), list[NDArray]()
+    evaluator = Evaluator(run.config, held_out, run.encoders, episodes=episodes)
+    first = list[NDArray]()
 
     def states() -> NDArray:
         found = [
@@ -220,7 +221,7 @@ def policy_episodes(run: LoadedRun, episodes: int) -> list[Episode]:
         return np.reshape(found, (*evaluator.shape, -1))
 
     result = evaluator.run(
-        snapshots_of(run, evaluator, _NUMBER),
+        evaluator.snapshots(run.algorithm, _NUMBER),
         run.algorithm.device,
         watch=lambda: None if first else first.append(states()),
     )

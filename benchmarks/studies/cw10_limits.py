@@ -169,11 +169,11 @@ def embed(dataset: TensorDictBase, encode: Callable[[Tensor], Tensor], seed: int
 
 def print_groups(dataset: TensorDictBase, encode: Callable[[Tensor], Tensor]) -> None:
     """Print groups and purity, by order of the tasks and seed of embedding and draws."""
-    starts, n_tasks = even_starts(len(CW10), DRAWS), len(CW10)
+    starts = even_starts(len(CW10), DRAWS)
     schedules = {
         "one after the other": TaskSchedule(starts),
         "the newest only": TaskSchedule(starts, cumulative=False),
-        "from the start": TaskSchedule((0,) * n_tasks),
+        "from the start": TaskSchedule((0,) * len(CW10)),
     }
     for seed in SEEDS:
         embedding = embed(dataset, encode, seed)
@@ -181,7 +181,7 @@ def print_groups(dataset: TensorDictBase, encode: Callable[[Tensor], Tensor]) ->
         for order, schedule in schedules.items():
             rows = [*draw(bank.seen(), schedule, DRAWS, seed)]
             groups, _, _ = form(bank.seen(), rows, BGPOConfig())
-            purity = 100 * group_purity(groups, bank.held_out(), n_tasks)
+            purity = 100 * group_purity(groups, bank.held_out())
             print(seed, order, len(groups.numbers), f"{purity:.0f} %", flush=True)
 
 

@@ -87,8 +87,8 @@ def grow(
 def describe(gwr: GWRB, bank: DemonstrationBank, seeds: tuple[int, ...]) -> pd.DataFrame:
     """Return a row of each network: nodes, task inference, and places of the tasks' nodes."""
     n_tasks, seen = len(bank.tasks), bank.seen()
-    task_of_node = majority_task(match_counts(gwr, seen, n_tasks))
-    inferred = task_inference_accuracy(gwr, seen, bank.held_out("test"), n_tasks)
+    task_of_node = majority_task(match_counts(gwr, seen))
+    inferred = task_inference_accuracy(gwr, seen, bank.held_out("test"))
     rows = []
     for index, seed in enumerate(seeds):
         weights = gwr.graph(index).weights.numpy().astype(np.float64)
@@ -144,7 +144,7 @@ def study(arguments: Arguments) -> str:
                 ]
             )
             if scale == 1.0 and not any(starts):
-                counts = match_counts(gwr, bank.seen(), len(bank.tasks))
+                counts = match_counts(gwr, bank.seen())
                 graph = gwr.graph(0)
                 task = majority_task(counts)[0, : len(graph.weights)]
                 save_figure(plot_gwr_pca(graph.weights, task, bank.tasks), out / "nodes.png")

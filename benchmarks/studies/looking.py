@@ -32,7 +32,7 @@ from shared import (
 
 from bgpo_trl.analysis import statistics
 from bgpo_trl.analysis.tables import Table, markdown
-from bgpo_trl.evaluation import evaluator_of, snapshots_of, start_seeds
+from bgpo_trl.evaluation import Evaluator, start_seeds
 from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.figures.style import COLORS, readable, save_figure
 from bgpo_trl.files.progress import progress_bar
@@ -178,8 +178,8 @@ def measure_looking(
         scene = NICO
         if hidden is not None:
             scene = replace(NICO, make_env=partial(HidingEnv, hidden=hidden))
-        evaluator = evaluator_of(run, held_out, episodes, scene=scene)
-        snapshots = snapshots_of(run, evaluator, _NUMBER)
+        evaluator = Evaluator(config, held_out, run.encoders, episodes=episodes, scene=scene)
+        snapshots = evaluator.snapshots(run.algorithm, _NUMBER)
         success = evaluator.run(snapshots, run.algorithm.device, watch).success
         found[name] = success.double().mean(-1).numpy()
         evaluator.simulation.close()

@@ -21,7 +21,7 @@ from bgpo_trl.analysis.task_inference import task_inference_accuracy
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.representation import embed_demonstrations
-from bgpo_trl.evaluation import Evaluator, Snapshot, evaluator_of
+from bgpo_trl.evaluation import Evaluator, Snapshot
 from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.figures.style import COLORS, add_legend, readable, save_figure, style_axes
 from bgpo_trl.files.writing import check_folder
@@ -85,7 +85,7 @@ def show(
             tested = DemonstrationBank(
                 phi, label, torch.zeros_like(label, dtype=torch.bool), policy.tasks
             )
-            inferred[:, number] = task_inference_accuracy(algorithm.gwr, seen, tested, n_tasks)
+            inferred[:, number] = task_inference_accuracy(algorithm.gwr, seen, tested)
     measured = {"success": success, "task_inference": inferred, "activity": activity}
     columns = {name: values.flatten().numpy() for name, values in measured.items()}
     index = pd.MultiIndex.from_product([seeds, policy.tasks], names=["seed", "task"])
@@ -105,7 +105,7 @@ def measure(
     if episodes < 1:
         raise ValueError(f"--episodes must be at least 1, got {episodes}")
     tasks, config = policy.tasks, policy.config
-    evaluator = evaluator_of(policy, policy.bank.held_out(), episodes)
+    evaluator = Evaluator(config, policy.bank.held_out(), policy.encoders, episodes=episodes)
     with tempfile.TemporaryDirectory() as folder:
         shown = record_demonstrations(
             folder,

@@ -21,9 +21,8 @@ from bgpo_trl.analysis.comparison import check_conditions, title_of
 from bgpo_trl.analysis.scores import late_scores
 from bgpo_trl.analysis.tables import Section, Table
 from bgpo_trl.experiments.command_line import command_line
-from bgpo_trl.experiments.report import text_of
-from bgpo_trl.figures.style import COLORS, LINES, MARKERS, readable, save_figure
-from bgpo_trl.files.writing import make_folder, write_whole
+from bgpo_trl.experiments.report import write_sections
+from bgpo_trl.figures.style import COLORS, LINES, MARKERS, readable
 from bgpo_trl.runs.results import Run, joined, read_run, run_directories
 
 
@@ -64,8 +63,8 @@ def runs_by(directories: Sequence[Path], name: str) -> dict[float, Run]:
     return dict(sorted(found.items()))
 
 
-def section_by(runs: dict[float, Run], name: str, out: Path) -> Section:
-    """Return the section of success by a number, and draw its figure."""
+def section_by(runs: dict[float, Run], name: str) -> Section:
+    """Return the section of success by a number, with its figure."""
     first = next(iter(runs.values()))
     scores = {value: late_scores(run) for value, run in runs.items()}
     table: Table = [[name, "seeds", "success", *first.tasks, "random actions"]]
@@ -74,17 +73,15 @@ def section_by(runs: dict[float, Run], name: str, out: Path) -> Section:
         cells = [statistics.mean(column).percent() for column in (success.mean(1), *success.T)]
         by_chance = " ".join(f"{100 * random[task]:.0f}" for task in first.tasks if task in random)
         table.append([f"{value:g}", str(len(success)), *cells, by_chance or "-"])
-    path = out / f"by-{name}.png"
-    label = name.replace("_", " ").capitalize()
-    save_figure(plot_by(scores, first.tasks, label=label), path, dpi=150)
+    figure = plot_by(scores, first.tasks, label=name.replace("_", " ").capitalize())
     commands = {value: run.summary.get("command") for value, run in runs.items()}
     notes = [
         f"{first.last:,} episodes each; success in percent, in tests over the last 10 % of "
         "training, means over seeds with 95 % intervals (Student's t).",
         *(f"{value:g}: `{command}`" for value, command in commands.items() if command),
     ]
-    caption = f"means over seeds, and each seed, by {name}"
-    return Section(f"Success by {name}: {title_of(first)}", table, {caption: path}, notes)
+    figures = {f"means over seeds, and each seed, by {name}": (f"by-{name}.png", figure)}
+    return Section(f"Success by {name}: {title_of(first)}", table, figures, notes)
 
 
 def plot_by(success: Mapping[float, ArrayLike], tasks: Sequence[str], *, label: str) -> Figure:
@@ -128,10 +125,7 @@ def success_by(arguments: ByArguments) -> str:
     if not arguments.runs or (arguments.out is None and len(arguments.runs) > 1):
         raise ValueError("name a folder of runs, or several and --out")
     runs = runs_by(run_directories(arguments.runs), arguments.by)
-    out = make_folder(arguments.out or arguments.runs[0])
-    text = text_of([section_by(runs, arguments.by, out)], out)
-    write_whole(out / "tables.md", text)
-    return text
+    return write_sections([section_by(runs, arguments.by)], arguments.out or arguments.runs[0])
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from bgpo_trl.analysis.statistics import mean
 from bgpo_trl.analysis.tables import markdown
-from bgpo_trl.evaluation import Snapshot, evaluator_of, snapshots_of
+from bgpo_trl.evaluation import Evaluator, Snapshot
 from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.writing import check_folder
@@ -91,8 +91,8 @@ def measure_trained(
         raise ValueError(f"--episodes must be at least 1, got {episodes}")
     config, rows = run.config, list[Row]()
     held_out = run.bank.held_out(config.held_out)
-    evaluator = evaluator_of(run, held_out, episodes)
-    snapshots = snapshots_of(run, evaluator, _NUMBER)
+    evaluator = Evaluator(config, held_out, run.encoders, episodes=episodes)
+    snapshots = evaluator.snapshots(run.algorithm, _NUMBER)
     chooses = all("only_clone" in snapshot.policy.parameters for snapshot in snapshots)
     for name, change in POLICIES.items() if chooses else [*POLICIES.items()][:1]:
         tested = [_changed(snapshot, change) for snapshot in snapshots]

@@ -77,7 +77,7 @@ class Setting:
     @property
     def _more(self) -> list[str]:
         """The schedule by which presented tasks are drawn, if not the usual one, and the order."""
-        schedule = _schedule(self.first)
+        schedule = self.first.schedule
         return [what for what in (schedule * (schedule != _USUAL), self.order) if what]
 
     @property
@@ -126,7 +126,7 @@ def read_settings(directories: Sequence[Path]) -> tuple[list[Setting], str]:
         if run.unfinished:
             waiting.append(f"{directory} {run.unfinished}")
         else:
-            kind = (run.tasks, not any(run.starts), _rising(run.starts), _schedule(run))
+            kind = (run.tasks, not any(run.starts), _rising(run.starts), run.schedule)
             groups.setdefault(kind, []).append(run)
     left_out = f"{'; '.join(waiting)}: let them finish" if waiting else ""
     if not groups:
@@ -146,10 +146,6 @@ def read_settings(directories: Sequence[Path]) -> tuple[list[Setting], str]:
 
 def _rising(starts: Sequence[int]) -> bool:
     return all(start < end for start, end in pairwise(starts))
-
-
-def _schedule(run: Run) -> str:
-    return run.config.get("schedule", _USUAL)
 
 
 def _setting(runs: list[Run]) -> Setting:
@@ -213,7 +209,7 @@ def check_conditions(run: Run, other: Run, ignored: Sequence[str] = ()) -> None:
 
 def _conditions(run: Run) -> dict[str, Any]:
     algorithm = run.config.get("algorithm")
-    known: dict[str, Any] = {"eval_every": run.eval_every, "schedule": _USUAL}
+    known: dict[str, Any] = {"eval_every": run.eval_every, "schedule": run.schedule}
     if isinstance(algorithm, dict) and "max_steps" in algorithm:
         known["max_steps"] = algorithm["max_steps"]
     return known | {k: v for k, v in run.config.items() if k not in _OF_THE_RUN}

@@ -148,15 +148,12 @@ def trials_to(success: ArrayLike, threshold: float = 0.5, *, window: int = 20) -
 def own_episodes(run: Run, threshold: float = 0.5) -> Values | None:
     """Return the training episodes of each task until a rate of them succeed, ``[S, T]``.
 
-    See `trials_to`; infinite where that was not reached. None if the run has no
-    ``train.csv``.
+    See `trials_to`; infinite where that was not reached. None without training episodes on record.
     """
-    if run.training is None:
+    if run.training is None or run.training.empty:
         return None
     table = run.training.sort_values(["seed", "episode"])
     table = table[table["episode"] <= run.last]
-    if table.empty:
-        return None
     times = table.groupby(["seed", "task"])["success"].agg(trials_to, threshold)
     found = run.by_seed_and_task(times)
     return np.where(np.isnan(found), np.inf, found)
@@ -201,14 +198,13 @@ def final_means(run: Run, kind: str, column: str) -> Values | None:
     return None if np.isnan(values).all() else values
 
 
-def expected_own_episodes(
-    begun: Sequence[int], task: int, episodes: ArrayLike, *, practised: bool = True
-) -> Values:
+def expected_own_episodes(run: Run, task: int, episodes: ArrayLike) -> Values:
     """Return the expected number of a task's own training episodes after ``episodes`` ``[E]``.
 
     An episode is of each task presented so far with equal probability; if earlier tasks are not
-    ``practised``, of each of the newest. ``begun`` are the episodes from which tasks are presented.
+    practised, of each of the newest.
     """
+    begun, practised = run.starts, run.schedule == "practised"
     later = sorted({start for start in begun if start >= begun[task]})
     played = np.zeros(np.shape(episodes))
     for start, end in pairwise([*later, np.inf]):
@@ -233,9 +229,7 @@ def forward_transfer(run: Run, reference: Run) -> Estimate | None:
     left = 1 - height
     if (left == 0).any():
         return None
-    gained = contrast(
-        [(ours / left).mean(-1), (theirs * (1 - area) / left**2).mean(-1)], [1.0, -1.0]
-    )
+    gained = contrast((ours / left).mean(-1), (theirs * (1 - area) / left**2).mean(-1))
     # Not the difference of the contributions, but it has their interval.
     shift = float(((area - height) / left).mean()) - gained.value
     return Estimate(*(bound + shift for bound in gained))
@@ -254,7 +248,7 @@ def own_areas(run: Run, reference: Run) -> tuple[Values, Values]:
     for task, end in enumerate([*begun[2:], run.last], 1):
         own, curves = _own_curves(run, task)
         of_reference, others = _own_curves(reference, reference.tasks.index(run.tasks[task]))
-        last = min(float(_own_episodes(run, task, end)), of_reference[-1])
+        last = min(float(expected_own_episodes(run, task, end)), of_reference[-1])
         first = min(max(own[0], of_reference[0]), last)
         tests = np.array([first, *own[(own > first) & (own < last)], last])
         areas.append((_mean_height(tests, own, curves), _mean_height(tests, of_reference, others)))
@@ -264,14 +258,9 @@ def own_areas(run: Run, reference: Run) -> tuple[Values, Values]:
 
 def _own_curves(run: Run, task: int) -> tuple[Values, Values]:
     """Return a task's expected own episodes at its tests, ``[E]``, and the curves, ``[S, E]``."""
-    own = _own_episodes(run, task, run.episodes)
+    own = expected_own_episodes(run, task, run.episodes)
     played = np.diff(own, prepend=0.0) > 0
     return own[played], run.success[:, played, task]
-
-
-def _own_episodes(run: Run, task: int, episodes: ArrayLike) -> Values:
-    practised = run.config.get("schedule", "practised") == "practised"
-    return expected_own_episodes(run.starts, task, episodes, practised=practised)
 
 
 def _mean_height(tests: Values, episodes: Values, curves: Values) -> Values:

@@ -9,7 +9,6 @@ in points (0 to 100).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,7 +20,6 @@ MARGIN = 0.05
 """Two runs count as equivalent if their difference is within this margin, stated beforehand."""
 # More assignments of seeds to two runs than this are sampled. Eight against eight are 12,870.
 _PERMUTATIONS = 20_000
-_SIGNS = (1.0, -1.0, -1.0, 1.0)
 
 
 class Estimate(NamedTuple):
@@ -48,23 +46,19 @@ class Estimate(NamedTuple):
         return f" [{low:{sign}.0f}, {high:{sign}.0f}]"
 
 
-def contrast(
-    samples: Sequence[ArrayLike], weights: Sequence[float], confidence: float = 0.95
-) -> Estimate:
-    """Return the sum of ``weights`` times the means of independent samples, with its t interval.
+def contrast(*samples: ArrayLike, confidence: float = 0.95) -> Estimate:
+    """Return the mean of a sample ``[S]``, or that minus the mean of a second, with its t interval.
 
-    Weights (1,) make a mean, (1, -1) a difference, (1, -1, -1, 1) a difference of differences. The
-    degrees of freedom are by Welch and Satterthwaite. Samples are ``[S]`` each.
+    The degrees of freedom are by Welch and Satterthwaite.
 
     Raises:
         ValueError: If a sample is empty, not finite or not a vector.
     """
     value, variances, freedoms = 0.0, [], []
-    for sample, weight in zip(map(_checked, samples), weights, strict=True):
-        value += weight * sample.mean()
+    for sample, sign in zip(map(_checked, samples), (1.0, -1.0), strict=False):
+        value += sign * sample.mean()
         # The variance of a single score is unknown.
-        spread = sample.var(ddof=1) if len(sample) > 1 else math.nan
-        variances.append(weight**2 * spread / len(sample))
+        variances.append(sample.var(ddof=1) / len(sample) if len(sample) > 1 else math.nan)
         freedoms.append(len(sample) - 1)
     error = math.sqrt(sum(variances))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -77,12 +71,12 @@ def contrast(
 
 def mean(scores: ArrayLike) -> Estimate:
     """Return the mean of the seeds' scores ``[S]`` with its 95 % interval."""
-    return contrast([scores], [1.0])
+    return contrast(scores)
 
 
 @dataclass(frozen=True)
 class Difference:
-    """The difference between two runs, or between the differences of two pairs of runs."""
+    """The difference between two runs."""
 
     estimate: Estimate
     """With its 95 % interval."""
@@ -102,13 +96,9 @@ class Difference:
         return side or "not decided"
 
 
-def difference(*samples: ArrayLike) -> Difference:
-    """Return the difference of the mean scores ``[S]`` of two runs, first minus second.
-
-    Of four runs: the difference between the first two minus that between the last two.
-    """
-    signs = _SIGNS[: len(samples)]
-    return Difference(contrast(samples, signs), contrast(samples, signs, 0.9))
+def difference(first: ArrayLike, second: ArrayLike) -> Difference:
+    """Return the difference of the mean scores ``[S]`` of two runs, first minus second."""
+    return Difference(contrast(first, second), contrast(first, second, confidence=0.9))
 
 
 def permutation_p(first: ArrayLike, second: ArrayLike) -> float:

@@ -1,6 +1,6 @@
 """Sections of a report: success, differences, forgetting and transfer, learning times, groups.
 
-A function of a section returns a list, which is empty where no run has what the section is about.
+Sections that not every setting has come as a list, which may be empty.
 """
 
 from __future__ import annotations
@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from bgpo_trl.analysis import statistics
 from bgpo_trl.analysis.comparison import Setting
@@ -31,6 +31,8 @@ from bgpo_trl.runs.results import Run
 
 Table = list[list[str]]
 """Rows of cells; the first row holds the column names."""
+Figures = dict[str, tuple[str, Figure]]
+"""File names and figures by caption."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,7 @@ class Section:
     title: str
     table: Table = field(default_factory=list)
     """Omitted if empty."""
-    figures: dict[str, Path] = field(default_factory=dict)
-    """Paths by caption."""
+    figures: Figures = field(default_factory=dict)
     notes: Sequence[str] = ()
 
 
@@ -57,7 +58,7 @@ _PAIRS = {
 }
 
 
-def success_section(setting: Setting) -> list[Section]:
+def success_section(setting: Setting) -> Section:
     """Return the conditions of a setting, and the success of its runs."""
     first = setting.first
     conditions = {name: first.config.get(name) for name in ("held_out", "eval_episodes")}
@@ -90,7 +91,7 @@ def success_section(setting: Setting) -> list[Section]:
         solved = ~np.isnan(steps)
         row += [_mean_cell(steps[solved]), _mean_cell(demonstrated[solved])]
         rows.append([*row, statistics.mean(area.mean(1)).percent()])
-    return [Section(setting.title, rows, notes=notes)]
+    return Section(setting.title, rows, notes=notes)
 
 
 def _mean_cell(steps: Values) -> str:
@@ -140,7 +141,7 @@ def difference_section(setting: Setting) -> list[Section]:
     return [Section(f"Differences: {setting.title}", rows, notes=notes)] if pairs else []
 
 
-def sequence_section(setting: Setting, reference: Setting | None) -> list[Section]:
+def sequence_section(setting: Setting, reference: Setting | None) -> Section:
     """Return forgetting and transfer in a setting with tasks one after the other."""
     rows = [["", "forgetting", "forward transfer"]]
     for name, run in setting.runs.items():
@@ -156,7 +157,7 @@ def sequence_section(setting: Setting, reference: Setting | None) -> list[Sectio
         "its own episodes, from the first to the last test of its phase; reference: the same "
         "algorithm with all tasks from the start, whose seeds count in the interval.",
     )
-    return [Section(f"Forgetting and transfer: {setting.title}", rows, notes=notes)]
+    return Section(f"Forgetting and transfer: {setting.title}", rows, notes=notes)
 
 
 def speed_section(setting: Setting, share: float) -> list[Section]:

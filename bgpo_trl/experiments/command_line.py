@@ -68,13 +68,10 @@ def command_line(
 
 
 def import_plugin(module: str | None) -> None:
-    """Import the user's module, from the current folder or installed.
+    """Import the user's module, if there is a name, from the current folder or installed.
 
     It may add tasks with `suites.nico.add_task`, and entries to `bgpo_trl.scenes.SCENES`,
     `bgpo_trl.algorithms.ALGORITHMS` and `bgpo_trl.modules.frame_network.FRAME_NETWORKS`.
-
-    Args:
-        module: Name of the module; nothing is imported if None.
 
     Raises:
         ValueError: If there is no such module, or another one has its name.

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from bgpo_trl.analysis.tables import Table, markdown
-from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
+from bgpo_trl.analysis.task_inference import group_counts, group_purity, task_inference_accuracy
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.experiments.arguments import GroupsArguments
@@ -35,7 +35,7 @@ def draw(bank: DemonstrationBank, schedule: TaskSchedule, draws: int, seed: int)
 
 def own_groups(group: Tensor, task: Tensor) -> set[int]:
     """Return the tasks most of whose demonstrations are in a group that holds mostly theirs."""
-    counts = _counts(group, task)
+    counts = group_counts(group, task)
     largest = counts.argmax(0)
     is_own = counts[largest].argmax(-1) == torch.arange(len(largest))
     return {*(is_own & (counts.sum(0) > 0)).nonzero().flatten().tolist()}
@@ -43,15 +43,9 @@ def own_groups(group: Tensor, task: Tensor) -> set[int]:
 
 def sharing(group: Tensor, task: Tensor) -> set[tuple[int, int]]:
     """Return the pairs of tasks of which one group holds more than a tenth each."""
-    counts = _counts(group, task)
+    counts = group_counts(group, task)
     held = counts / counts.sum(0).clamp(min=1) > 0.1
     return {pair for row in held for pair in combinations(row.nonzero().flatten().tolist(), 2)}
-
-
-def _counts(group: Tensor, task: Tensor) -> Tensor:
-    """Return the number of demonstrations by group and task, ``[G, T]``."""
-    counts = torch.zeros(int(group.max()) + 1, int(task.max()) + 1)
-    return counts.index_put_((group, task), torch.tensor(1.0), accumulate=True)
 
 
 def form(
@@ -112,11 +106,11 @@ def groups(arguments: GroupsArguments) -> str:
             gwr = GWRB(seen.embedding.shape[-1], fine, generator=random)
             for row in rows:
                 gwr.adapt(seen.embedding[row])
-            inferred = task_inference_accuracy(gwr, seen, held_out, n_tasks)
+            inferred = task_inference_accuracy(gwr, seen, held_out)
             columns.append(
                 [
                     f"{len(formed.numbers)}",
-                    f"{100 * group_purity(formed, held_out, n_tasks):.4g}",
+                    f"{100 * group_purity(formed, held_out):.4g}",
                     f"{max(needed.values())}" if len(needed) == n_tasks else "never",
                     f"{seconds:.1f}",
                     f"{int(gwr.num_nodes)}",

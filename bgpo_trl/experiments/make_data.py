@@ -34,11 +34,11 @@ def record(arguments: RecordArguments) -> None:
 def encoders(arguments: EncodersArguments) -> str:
     """Train both encoders on recordings, and embed these; see `train_encoders`."""
     dataset, meta = load_demonstrations(arguments.dataset), read_meta(arguments.dataset)
-    scene, weights, keep = find_scene(meta["scene"]), arguments.weights, arguments.keep
+    scene, keep = find_scene(meta["scene"]), arguments.keep
     train_encoders(
         dataset,
-        None if arguments.play is None else _play(arguments.play, scene),
-        arguments.folder / "encoders.safetensors" if weights is None else weights,
+        _play(arguments.play, scene),
+        arguments.weights or arguments.folder / "encoders.safetensors",
         arguments.folder,
         arguments.config,
         tasks=meta["tasks"],
@@ -51,8 +51,10 @@ def encoders(arguments: EncodersArguments) -> str:
     return verdict_in(arguments.folder, scene)
 
 
-def _play(path: Path, scene: Scene) -> TensorDict:
-    """Open recorded play of a scene; raise ``ValueError`` if it is of another one."""
+def _play(path: Path | None, scene: Scene) -> TensorDict | None:
+    """Open recorded play, if any; raise ``ValueError`` if it is of another scene."""
+    if path is None:
+        return None
     meta = read_meta(path)
     recorded_in = f"{meta['scene']} {meta['scene_version']}"
     scene.check_identity(recorded_in, path, "record play of this scene")
@@ -61,14 +63,14 @@ def _play(path: Path, scene: Scene) -> TensorDict:
 
 def bank(arguments: MakeBankArguments) -> None:
     """Embed a recorded dataset with trained encoders; see `make_bank`."""
-    meta, weights = read_meta(arguments.dataset), arguments.encoders
+    meta = read_meta(arguments.dataset)
     scene = find_scene(meta["scene"])
-    weights = default_weights(scene=scene) if weights is None else weights
+    weights = arguments.encoders or default_weights(scene=scene)
     made = make_bank(
         load_representation(weights, scene=scene),
         load_demonstrations(arguments.dataset),
         tasks=meta["tasks"],
-        actions=scene.bank_actions if arguments.actions is None else arguments.actions,
+        actions=arguments.actions or scene.bank_actions,
         spread=meta["spread"],
     )
     made.save(arguments.out)
@@ -76,11 +78,9 @@ def bank(arguments: MakeBankArguments) -> None:
 
 def probes(arguments: ProbesArguments) -> str:
     """Evaluate trained encoders with probes; see `probe`."""
-    meta, weights = read_meta(arguments.dataset), arguments.encoders
+    meta, dataset = read_meta(arguments.dataset), load_demonstrations(arguments.dataset)
     scene = find_scene(meta["scene"])
-    weights = default_weights(meta["tasks"], scene=scene) if weights is None else weights
-    representation = load_representation(weights, scene=scene)
-    play = None if arguments.play is None else _play(arguments.play, scene)
-    dataset = load_demonstrations(arguments.dataset)
+    weights = arguments.encoders or default_weights(meta["tasks"], scene=scene)
+    representation, play = load_representation(weights, scene=scene), _play(arguments.play, scene)
     probe(representation, dataset, arguments.out, play=play, columns=scene.state)
     return verdict_in(arguments.out, scene)

@@ -10,14 +10,21 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+from matplotlib.figure import Figure
 
+from bgpo_trl.algorithms import Algorithm
 from bgpo_trl.analysis.scores import final_means
-from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
+from bgpo_trl.analysis.task_inference import (
+    group_purity,
+    majority_task,
+    match_counts,
+    task_inference_accuracy,
+)
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.evaluation import evaluate_random_policy, evaluator_of, snapshots_of
+from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
 from bgpo_trl.figures.frames import file_names, plot_frame_strips, save_gif
 from bgpo_trl.figures.groups import plot_groups
-from bgpo_trl.figures.gwr import draw_nodes
+from bgpo_trl.figures.gwr import plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import plot_step_curves, plot_success_curves
 from bgpo_trl.files.progress import progress_bar
@@ -62,9 +69,7 @@ def measure(
     if algorithm.groups:
         held_out = bank.held_out(config.held_out)
         summary["groups"] = [len(groups.numbers) for groups in algorithm.groups]
-        summary["group_purity"] = [
-            group_purity(groups, held_out, len(config.tasks)) for groups in algorithm.groups
-        ]
+        summary["group_purity"] = [group_purity(groups, held_out) for groups in algorithm.groups]
     return summary
 
 
@@ -90,8 +95,8 @@ def _final_tests(trainer: Trainer, bank: DemonstrationBank, *, episodes: int) ->
     for half, (kind, tested) in enumerate(
         (("seen", seen), ("held-out", bank.held_out(config.held_out))), 1
     ):
-        evaluator = evaluator_of(trainer, tested, episodes, starts=config.task_starts)
-        snapshots = snapshots_of(trainer, evaluator, _LAST)
+        evaluator = _evaluator(trainer, tested, episodes)
+        snapshots = evaluator.snapshots(algorithm, _LAST)
         result = evaluator.run(snapshots, algorithm.device, watch=bar.update)
         success = result.success
         bar.set_postfix_str(f"success {success.float().mean():.2f}, {kind}", refresh=False)
@@ -100,7 +105,7 @@ def _final_tests(trainer: Trainer, bank: DemonstrationBank, *, episodes: int) ->
             of_task = tested.of_task(task)
             inferred = torch.full((len(config.seeds),), torch.nan)
             if gwr is not None:
-                inferred = task_inference_accuracy(gwr, seen, of_task, len(config.tasks))
+                inferred = task_inference_accuracy(gwr, seen, of_task)
             for index, seed in enumerate(config.seeds):
                 won = success[index, task]
                 steps = result.steps[index, task][won].double().mean()  # NaN without a success
@@ -109,6 +114,11 @@ def _final_tests(trainer: Trainer, bank: DemonstrationBank, *, episodes: int) ->
                 rows.append((seed, kind, name, episodes, *cells))
     bar.close()
     return pd.DataFrame(rows, columns=pd.Index([*COLUMNS["final.csv"]]))
+
+
+def _evaluator(trainer: Trainer, bank: DemonstrationBank, episodes: int) -> Evaluator:
+    config = trainer.config
+    return Evaluator(config, bank, trainer.encoders, episodes=episodes, starts=config.task_starts)
 
 
 def draw(
@@ -130,7 +140,7 @@ def draw(
     for name, frames in zip(file_names(config.tasks), episodes.values(), strict=True):
         save_gif(frames, out / "figures" / f"{name}.gif", fps=find_scene(config.scene).rate or 5.0)
     if summary["nodes"] is not None:
-        draw_nodes(out / "figures" / "gwr.png", trainer.algorithm, bank, config.tasks)
+        save_figure(plot_first_gwr(trainer.algorithm, bank.seen()), out / "figures" / "gwr.png")
         inferred = np.asarray(final_means(run, "held-out", "task_inference"))
         lines.append(f"GWR-B nodes: {summary['nodes']}")
         lines.append(f"task inference on held-out demonstrations: {inferred.mean():.1%}")
@@ -142,6 +152,15 @@ def draw(
             "a group of their task"
         )
     return lines
+
+
+def plot_first_gwr(algorithm: Algorithm, seen: DemonstrationBank) -> Figure:
+    """Plot the first seed's GWR-B (Fig. 7); ``seen`` defines its nodes' majority tasks."""
+    assert algorithm.gwr is not None
+    weights = algorithm.gwr.graph(0).weights
+    tasks = majority_task(match_counts(algorithm.gwr, seen)[0])[: len(weights)]
+    groups = algorithm.groups[0].lookup(weights).group if algorithm.groups else None
+    return plot_gwr_pca(weights, tasks, seen.tasks, groups)
 
 
 def success_lines(run: Run) -> list[str]:
@@ -172,9 +191,9 @@ def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.n
     """
     config, frames = trainer.config, []
     held_out = bank.held_out(config.held_out)
-    evaluator = evaluator_of(trainer, held_out, 1, starts=config.task_starts)
+    evaluator = _evaluator(trainer, held_out, 1)
     result = evaluator.run(
-        snapshots_of(trainer, evaluator, _LAST),
+        evaluator.snapshots(trainer.algorithm, _LAST),
         trainer.algorithm.device,
         watch=lambda: frames.append(evaluator.simulation.frames()[0, :, 0]),
     )

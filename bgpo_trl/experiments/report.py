@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import numpy as np
 from bgpo_trl.analysis.comparison import Setting, read_settings, reference_of
 from bgpo_trl.analysis.scores import success_matrix, success_steps
 from bgpo_trl.analysis.tables import (
+    Figures,
     Section,
     cost_section,
     difference_section,
@@ -37,40 +38,36 @@ _DPI = 150
 _CURVES = len(COLORS)
 
 
-def draw_curves(setting: Setting, out: Path) -> dict[str, Path]:
-    """Draw the learning curves of a setting, some runs to a figure; paths by caption."""
-    figures: dict[str, Path] = {}
+def curves_of(setting: Setting) -> Figures:
+    """Plot the learning curves of a setting, some runs to a figure."""
+    figures: Figures = {}
+    window = 3 * setting.first.eval_every
     for start in range(0, len(setting.runs), _CURVES):
         runs = dict(list(setting.runs.items())[start : start + _CURVES])
         part = f"-{1 + start // _CURVES}" if start else ""
-        window = 3 * setting.first.eval_every
-        path = out / f"{setting.slug}{part}.png"
-        save_figure(plot_success_curves(runs, window=window), path, _DPI)
-        figures[f"mean and one standard deviation over seeds: {', '.join(runs)}"] = path
+        caption = f"mean and one standard deviation over seeds: {', '.join(runs)}"
+        figures[caption] = f"{setting.slug}{part}.png", plot_success_curves(runs, window=window)
         solving = {n: run for n, run in runs.items() if np.isfinite(success_steps(run)).any()}
         if solving:
-            path = out / f"{setting.slug}-steps{part}.png"
-            save_figure(plot_step_curves(solving, window=window), path, _DPI)
-            figures[f"steps of a success, shown likewise: {', '.join(solving)}"] = path
+            caption = f"steps of a success, shown likewise: {', '.join(solving)}"
+            name = f"{setting.slug}-steps{part}.png"
+            figures[caption] = name, plot_step_curves(solving, window=window)
     return figures
 
 
-def draw_sequence(setting: Setting, out: Path) -> dict[str, Path]:
-    """Draw success after each phase as heat maps; paths by caption."""
-    path = out / f"{setting.slug}-matrix.png"
-    matrices = {name: success_matrix(run).mean(0) for name, run in setting.runs.items()}
-    save_figure(plot_success_matrices(matrices, setting.first.tasks), path, _DPI)
-    return {"success on each task after each phase": path}
-
-
-def setting_sections(setting: Setting, reference: Setting | None, out: Path) -> list[Section]:
-    """Return the sections of a setting and draw its figures."""
-    sections = _drawn(success_section(setting), lambda: draw_curves(setting, out))
-    sections += difference_section(setting)
+def setting_sections(setting: Setting, reference: Setting | None) -> list[Section]:
+    """Return the sections of a setting, with their figures."""
+    success = replace(success_section(setting), figures=curves_of(setting))
+    sections = [success, *difference_section(setting)]
     if setting.in_sequence:
         try:
             found = sequence_section(setting, reference)
-            sections += _drawn(found, lambda: draw_sequence(setting, out))
+            matrices = {name: success_matrix(run).mean(0) for name, run in setting.runs.items()}
+            figure = plot_success_matrices(matrices, setting.first.tasks)
+            drawn = {
+                "success on each task after each phase": (f"{setting.slug}-matrix.png", figure)
+            }
+            sections.append(replace(found, figures=drawn))
         except ValueError as error:  # tested too rarely
             title = f"Forgetting and transfer: {setting.title}"
             sections.append(Section(title, notes=[str(error)]))
@@ -80,49 +77,27 @@ def setting_sections(setting: Setting, reference: Setting | None, out: Path) -> 
     return sections + [run_section(f"{n}: {setting.title}", r) for n, r in setting.runs.items()]
 
 
-def _drawn(sections: list[Section], draw: Callable[[], dict[str, Path]]) -> list[Section]:
-    """Return sections with the figures that are drawn for them."""
-    return [replace(section, figures=draw()) for section in sections]
-
-
-def make_report(directories: Sequence[Path], out: Path) -> list[Section]:
-    """Compute the tables and draw the figures of runs."""
-    settings, left_out = read_settings(directories)
-    references = [reference_of(setting, settings) for setting in settings]
-    # All that may be refused comes before the first file.
-    for setting in settings:
-        for run in setting.runs.values():
-            run_section("", run)
-    make_folder(out)
-    sections = [Section("Left out", notes=[left_out])] if left_out else []
-    for setting, reference in zip(settings, references, strict=True):
-        sections += setting_sections(setting, reference, out)
-    return sections
-
-
-def text_of(sections: Sequence[Section], out: Path) -> str:
-    """Return sections in Markdown; figures are linked from the folder ``out``.
+def write_sections(sections: Sequence[Section], out: Path) -> str:
+    """Write ``tables.md`` and the figures of sections into a folder; return the tables.
 
     Notes name folders of this machine by their last name only, since reports are shared.
     """
+    make_folder(out)
     text = []
     for section in sections:
         text.append(f"## {section.title}")
         text += [markdown(section.table)] if section.table else []
-        text += [
-            f"![{caption}]({path.relative_to(out).as_posix()})"
-            for caption, path in section.figures.items()
-        ]
+        for caption, (name, figure) in section.figures.items():
+            save_figure(figure, out / name, _DPI)
+            text.append(f"![{caption}]({name})")
         text += ["\n".join(f"- {without_folders(note)}" for note in section.notes if note)]
-    return "\n\n".join(filter(None, text)) + "\n"
+    joined = "\n\n".join(filter(None, text)) + "\n"
+    write_whole(out / "tables.md", joined)
+    return joined
 
 
 def report(arguments: ReportArguments) -> str:
-    """Write the report that `ReportArguments` describes; return its tables.
-
-    Raises:
-        ValueError: If a run is damaged, none is finished, or conditions differ.
-    """
+    """Write the report that `ReportArguments` describes; return its tables."""
     named = list(arguments.runs)
     if not named:
         raise ValueError("name a run, or a folder of runs")
@@ -137,10 +112,11 @@ def report(arguments: ReportArguments) -> str:
         for directory, copy in zip(directories, copies, strict=True):
             archive_run(directory, copy)
         directories = copies
-    out = arguments.out or arguments.archive or named[0]
-    text = text_of(make_report(directories, out), out)
-    write_whole(out / "tables.md", text)
-    return text
+    settings, left_out = read_settings(directories)
+    sections = [Section("Left out", notes=[left_out])] if left_out else []
+    for setting in settings:
+        sections += setting_sections(setting, reference_of(setting, settings))
+    return write_sections(sections, arguments.out or arguments.archive or named[0])
 
 
 def _names_in(folder: Path) -> list[Path]:

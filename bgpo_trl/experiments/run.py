@@ -54,15 +54,11 @@ def concurrent(arguments: Arguments) -> str:
 def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
     """Train to the end, run the final tests and draw the figures.
 
-    In addition to the files of `Trainer`, the run directory gets ``final.csv`` (success and steps
-    of the trained policies with demonstrations seen in training and with held-out ones, and task
-    inference), ``figures/`` (including a video of a test episode of each task) and finally
-    ``summary.json`` (commit, versions of packages, changed hyperparameters, command, success of a
-    random policy, nodes of GWR-B, groups of behaviors).
+    In addition to the files of `Trainer`, the run directory gets ``final.csv``, ``figures/`` and
+    finally ``summary.json``, the mark of a complete run (docs/design.md).
 
     Raises:
-        ValueError: If the directory holds another run, or no run to resume; or if ``bank`` or
-            ``encoders`` are given although encoders are yet to be trained.
+        ValueError: If arguments do not go together, or the directory holds another run.
         BlockingIOError: If another process is using the directory.
     """
     _check(arguments, config)
@@ -73,15 +69,15 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
     size = arguments.preset or (arguments.config.stem if arguments.config else "quick")
     group = f"{name}-{config.name}"
     out = named_directory(arguments) or Path("runs") / f"{group}-{size}"
-    begun: tuple[RunConfig, Digests] | None = None
+    digests: Digests | None = None
     grown: Grown | None = None
     verdict = ""
     if not arguments.resume and holds_run(out):
         raise ValueError(f"{out} holds a run: --resume continues it, --out names another directory")
     if arguments.resume and (out / "config.json").exists():
-        begun = read_config(out / "config.json")
-        config = _continued(arguments, config, begun[0])
-        if arguments.add_task is None and _is_finished(out, config, begun[0]):
+        saved, digests = read_config(out / "config.json")
+        config = _continued(arguments, config, saved)
+        if arguments.add_task is None and _is_finished(out, config, saved):
             return f"{out} is finished, all {config.episodes} episodes: --episodes makes it longer"
     loggers: list[Callable[[], Logger]] = []
     if arguments.wandb is not None:
@@ -98,7 +94,7 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
             warnings.warn(verdict, stacklevel=2)
     with lock_directory(out):
         if grown is None:
-            encoders, bank = _inputs(arguments, config, out, device, begun)
+            encoders, bank = _inputs(arguments, config, out, device, digests)
         else:
             encoders, bank = grown.encoders, grown.bank
         with Trainer(
@@ -116,7 +112,6 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
             changed = changed_hyperparameters(config)
             summary = {**code, "changed": changed, **measure(trainer, bank, out)}
             lines = draw(trainer, bank, out, summary)
-            # Written last, as the mark of a complete run.
             write_json(out / "summary.json", summary)
     lines += [verdict] if verdict else []
     if arguments.train_encoders:
@@ -176,12 +171,12 @@ def _inputs(
     config: RunConfig,
     out: Path,
     device: torch.device,
-    begun: tuple[RunConfig, Digests] | None,
+    digests: Digests | None,
 ) -> tuple[Representation, DemonstrationBank]:
-    """Return the pretrained encoders and a bank, or new ones made in the run directory."""
+    """Return encoders and a bank: those of a run that has begun, trained ones, or new ones."""
     scene, bank = find_scene(config.scene), arguments.bank
-    if begun is not None and bank is None:
-        return load_inputs(out, config.tasks, begun[1], scene)
+    if digests is not None and bank is None:
+        return load_inputs(out, config.tasks, digests, scene)
     # A bank fits only the encoders that embedded it.
     given = arguments.encoders is not None or bank is not None
     stage = STAGE_PRESETS.get(arguments.preset or "", {})
@@ -218,13 +213,8 @@ def pretrained_for(
 ) -> tuple[Representation, DemonstrationBank]:
     """Load trained encoders and the demonstrations of some tasks.
 
-    Args:
-        tasks: Names of the tasks.
-        bank: Bank to take them from; those that it lacks are taken from the one beside the
-            encoders.
-        scene: The robot, or its name.
-        weights: File of the encoders; by default those that come with the scene, for the bank if
-            there is one.
+    Those that ``bank`` lacks are taken from the bank beside the encoders. By default, the file
+    ``weights`` of the encoders is the one of the bank or, without a bank, of the scene.
 
     Raises:
         ValueError: If a file is missing, damaged or of other encoders, no encoders come with the

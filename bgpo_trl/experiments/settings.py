@@ -13,7 +13,7 @@ from bgpo_trl.algorithms import ALGORITHMS, entry
 from bgpo_trl.configs import PRESETS, RunConfig
 from bgpo_trl.configs.runs import check_seeds
 from bgpo_trl.experiments.arguments import SETTINGS, Arguments
-from bgpo_trl.runs.config_file import read_config, read_settings
+from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.directory import differing_settings
 from bgpo_trl.scenes import Scene, find_scene
 
@@ -45,7 +45,7 @@ def run_config(
             raise ValueError("--add-task: a task that comes later is for `bgpo continual`")
         if any(config.task_starts) and (arguments.gives("task_starts") or "task_starts" in given):
             raise ValueError("--task-starts: all tasks are presented from the start here")
-        config = at_once(config)
+        config = replace(config, task_starts=(0,) * len(config.tasks))
     if config.eval_every > config.episodes:
         raise ValueError(
             f"eval_every must be at most the {config.episodes} episodes of the run, got "
@@ -66,10 +66,6 @@ def _begin(arguments: Arguments) -> RunConfig:
     path = path / "config.json" if path.is_dir() else path
     if not path.exists():
         raise ValueError(f"--config: there is no file {path}: name one, or a run directory")
-    settings = read_settings(path)
-    name = settings.get("name", preset.name)
-    if isinstance(name, str) and name in ALGORITHMS:
-        preset = replace(preset, name=name, algorithm=ALGORITHMS[name].config)
     return read_config(path, defaults=preset)[0]
 
 
@@ -121,11 +117,6 @@ def chosen_tasks(tasks: tuple[str, ...] | None, scene: Scene) -> tuple[str, ...]
     tasks = scene.all_tasks if tasks == ("all",) else tasks
     scene.check_tasks(tasks)
     return tasks
-
-
-def at_once(config: RunConfig) -> RunConfig:
-    """Return a run whose tasks are all presented from the start."""
-    return replace(config, task_starts=(0,) * len(config.tasks))
 
 
 def even_starts(n_tasks: int, episodes: int) -> tuple[int, ...]:

@@ -1,11 +1,8 @@
 """Sweeps on Ray: algorithms in settings over many seeds, in blocks of seeds.
 
-    bgpo sweep --algorithms bgpo maml dist-nll --settings concurrent continual \
-        --seeds 0 1 2 3 4 5 6 7 8 9 --block 5 --preset desk
-
-runs twelve jobs, as many at a time as there are cores. A job is a block of seeds of one algorithm
-in one setting, with a run directory such as ``runs/sweep/concurrent-bgpo/seeds-0-1-2-3-4``. Each is
-run to its end exactly once, even if workers are lost. ``bgpo report runs/sweep`` joins the blocks.
+A job is a block of seeds of one algorithm in one setting, with a run directory such as
+``runs/sweep/concurrent-bgpo/seeds-0-1-2-3-4``. As many run at a time as there are cores.
+``bgpo report runs/sweep`` joins the blocks.
 """
 
 from __future__ import annotations
@@ -42,17 +39,12 @@ RETRIES = 10
 
 @dataclass(frozen=True, eq=False)  # Own hyperparameters may not be hashable.
 class Job:
-    """A run of a block of seeds.
-
-    Attributes:
-        directory: Directory of the run.
-        config: The run.
-        arguments: Its module of tasks or algorithms, its bank and encoders.
-    """
+    """A run of a block of seeds."""
 
     directory: Path
     config: RunConfig
     arguments: Arguments = Arguments()  # noqa: RUF009, it is frozen
+    """Its module of tasks or algorithms, its bank and encoders."""
 
     def __str__(self) -> str:
         return f"{self.directory.parent.name}/{self.directory.name}"
@@ -141,7 +133,7 @@ def play(job: Job) -> None:
 
 @contextlib.contextmanager
 def connected(address: str, cpus: float, gpus: float) -> Iterator[None]:
-    """Connect to a Ray cluster, or start Ray on this machine, for the duration of the block.
+    """Connect to a Ray cluster, or start Ray on this machine, during the block.
 
     Raises:
         ValueError: If this machine is too small for a job.
@@ -172,11 +164,8 @@ def connected(address: str, cpus: float, gpus: float) -> Iterator[None]:
 
 
 def work(job: Job, play: Callable[[Job], None], command: Sequence[str]) -> None:
-    """Run a job in a worker unless it is finished, with its output in the job's ``log.txt``.
-
-    ``command`` is the value for ``sys.argv``, which Ray sets otherwise in a worker.
-    """
-    sys.argv = list(command)
+    """Run a job in a worker unless it is finished, with its output in the job's ``log.txt``."""
+    sys.argv = list(command)  # which Ray sets otherwise
     with (
         lock_directory(job.directory, wait=True),  # A worker that Ray lost may still be writing.
         open(job.directory / "log.txt", "a", buffering=1) as log,

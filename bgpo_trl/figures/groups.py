@@ -78,9 +78,7 @@ def _draw_rows(
     axes: Axes, seed: pd.DataFrame, tasks: Sequence[str], last: int, width: float
 ) -> None:
     """Draw the episodes of each group of a seed, in a row for each group."""
-    colors = {
-        task: color for task, (_, _, color, _) in zip(tasks, task_markers(tasks), strict=True)
-    }
+    colors = {tasks[number]: color for number, _, color, _ in task_markers(tasks)}
     # Points; the width of one episode on the axis, at least 0.4 to stay visible.
     line = max(0.4, 0.85 * 72 * width / last)
     numbers = []

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
-from bgpo_trl.algorithms import Algorithm
-from bgpo_trl.analysis.task_inference import majority_task, match_counts
-from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.figures.style import MARKERS, add_legend, save_figure, style_axes, task_markers
+from bgpo_trl.figures.style import add_legend, markers, style_axes, task_markers
 
 _NO_TASK = (-1, "no demonstration", "0.6", "x")
 # Paul Tol's muted colors, for groups, so that they are not taken for tasks.
@@ -38,7 +34,8 @@ def plot_gwr_pca(
     points, share = _principal_components(np.asarray(weights, dtype=np.float64))
     panels = [(np.asarray(node_task), [*task_markers(task_names), _NO_TASK])]
     if node_group is not None:
-        panels.append((np.asarray(node_group), _group_markers(node_group)))
+        names = {group: f"group {group}" for group in np.unique(node_group).tolist()}
+        panels.append((np.asarray(node_group), markers(names, _GROUP_COLORS)))
     width = 4.8
     figure = Figure(figsize=(width * len(panels), 4.6), layout="constrained")
     all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
@@ -64,19 +61,6 @@ def _principal_components(values: NDArray) -> tuple[NDArray, NDArray]:
     return centered @ directions[:2].T, share
 
 
-def _group_markers(groups: ArrayLike) -> list[tuple[int, str, str, str]]:
-    """Return number, legend name, color and marker of each group."""
-    return [
-        (
-            group,
-            f"group {group}",
-            _GROUP_COLORS[group % len(_GROUP_COLORS)],
-            MARKERS[group % len(MARKERS)],
-        )
-        for group in np.unique(groups).tolist()
-    ]
-
-
 def _draw_nodes(
     axes: Axes, points: NDArray, numbers: NDArray, marks: Sequence[tuple[int, str, str, str]]
 ) -> None:
@@ -90,22 +74,3 @@ def _draw_nodes(
         if marker != "x":
             dots.set(edgecolors="w")
         dots.set(label=f"{name} ({len(chosen)})", zorder=2 if number < 0 else 3)
-
-
-def draw_nodes(
-    path: Path, algorithm: Algorithm, bank: DemonstrationBank, tasks: Sequence[str]
-) -> None:
-    """Draw the nodes of the first seed's GWR-B (Fig. 7).
-
-    Args:
-        path: PNG file.
-        algorithm: An algorithm with GWR-B.
-        bank: Demonstrations that define the nodes' majority tasks.
-        tasks: Names of the tasks.
-    """
-    assert algorithm.gwr is not None
-    weights, groups = algorithm.gwr.graph(0).weights, None
-    node_tasks = majority_task(match_counts(algorithm.gwr, bank.seen(), len(tasks))[0])
-    if algorithm.groups:
-        groups = algorithm.groups[0].lookup(weights).group
-    save_figure(plot_gwr_pca(weights, node_tasks[: len(weights)], tasks, groups), path)

@@ -86,17 +86,19 @@ def mark_starts(axes: Axes, starts: Mapping[str, int], tasks: Sequence[str], las
         )
 
 
-def task_markers(task_names: Sequence[str]) -> list[tuple[int, str, str, str]]:
-    """Return position, legend name, color and marker of each task."""
+def markers(
+    names: Mapping[int, str], colors: Sequence[str] = COLORS
+) -> list[tuple[int, str, str, str]]:
+    """Return number, legend name, color and marker of each of some things, by their numbers."""
     return [
-        (
-            task,
-            f"task {task + 1}: {readable(name)}",
-            COLORS[task % len(COLORS)],
-            MARKERS[task % len(MARKERS)],
-        )
-        for task, name in enumerate(task_names)
+        (number, name, colors[number % len(colors)], MARKERS[number % len(MARKERS)])
+        for number, name in names.items()
     ]
+
+
+def task_markers(tasks: Sequence[str]) -> list[tuple[int, str, str, str]]:
+    """Return position, legend name, color and marker of each task."""
+    return markers({n: f"task {n + 1}: {readable(task)}" for n, task in enumerate(tasks)})
 
 
 def readable(name: str) -> str:

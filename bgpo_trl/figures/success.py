@@ -96,7 +96,9 @@ def _plot_curves(
     window = max(1, round(last / 20)) if window is None else window
 
     figure, panels = _make_panels(len(tasks))
-    grid = _grid(np.unique(np.concatenate([run.episodes for run in runs.values()])), last)
+    grid = np.unique(np.concatenate([run.episodes for run in runs.values()]))
+    if len(grid) > _GRID_POINTS:
+        grid = np.unique(np.linspace(0, last, _GRID_POINTS).round().astype(int))
     for panel, task in zip(panels.flat, [None, *tasks], strict=False):
         for index, (name, run) in enumerate(runs.items()):
             of_run = tests[name]
@@ -146,14 +148,6 @@ def _tidy_panels(panels: NDArray, n_tasks: int) -> None:
     for position, panel in enumerate(panels.flat[: n_tasks + 1]):
         if position + panels.shape[1] > n_tasks:
             panel.tick_params(labelbottom=True)
-
-
-def _grid(tested: NDArray, last: int) -> NDArray:
-    """Return the episodes at which curves are drawn: those with tests, or fewer."""
-    grid = np.sort(tested[tested <= last])
-    if len(grid) > _GRID_POINTS:
-        grid = np.unique(np.linspace(0, last, _GRID_POINTS).round().astype(int))
-    return grid
 
 
 def _trailing_mean(tests: pd.DataFrame, column: str, grid: NDArray, window: int) -> NDArray:

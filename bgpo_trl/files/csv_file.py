@@ -37,7 +37,7 @@ class CsvFile:
 
     def __init__(self, path: str | os.PathLike[str], columns: Sequence[str]) -> None:
         self.path, self.columns = Path(path), tuple(columns)
-        header = _csv_line(self.columns)
+        header = self._line(dict(zip(self.columns, self.columns, strict=True)))
         self._header_size = len(header)
         try:
             self._file = open(self.path, "a+b", buffering=0)  # noqa: SIM115
@@ -65,13 +65,7 @@ class CsvFile:
             ValueError: If the file has no such column.
             OSError: If the row cannot be written; the file then ends with the previous row.
         """
-        unknown = [name for name in row if name not in self.columns]
-        if unknown:
-            raise ValueError(
-                f"{self.path.name} has no column {', '.join(unknown)}: name it when the run is "
-                f"created, or write only {', '.join(self.columns)}."
-            )
-        self._append(_csv_line([plain_value(row.get(name)) for name in self.columns]))
+        self._append(self._line({name: plain_value(value) for name, value in row.items()}))
 
     def position(self) -> int:
         """Flush the file to disk and return its size in bytes."""
@@ -103,6 +97,11 @@ class CsvFile:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def _line(self, row: Mapping[str, Any]) -> bytes:
+        line = io.StringIO()
+        csv.DictWriter(line, self.columns, lineterminator="\n").writerow(row)
+        return line.getvalue().encode()
+
     def _append(self, line: bytes) -> None:
         start = self._file.seek(0, os.SEEK_END)
         try:
@@ -122,9 +121,3 @@ def plain_value(value: Any) -> Any:
     if hasattr(value, "item"):
         value = value.item()
     return int(value) if isinstance(value, bool) else value
-
-
-def _csv_line(fields: Sequence[Any]) -> bytes:
-    line = io.StringIO()
-    csv.writer(line, lineterminator="\n").writerow(fields)
-    return line.getvalue().encode()

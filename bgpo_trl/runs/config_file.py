@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict, is_dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_type_hints
 
@@ -51,13 +51,8 @@ _Loader.add_implicit_resolver(
 )
 
 
-def read_settings(path: Path) -> dict[str, Any]:
-    """Return the entries of a file of settings, YAML or JSON, which is YAML too.
-
-    Raises:
-        ValueError: If the file is missing or damaged, gives a key twice, or is no mapping of names
-            to values.
-    """
+def _read_settings(path: Path) -> dict[str, Any]:
+    """Return the entries of a file of settings, YAML or JSON, which is YAML too."""
     try:
         found = yaml.load(path.read_text(), Loader=_Loader)
     except FileNotFoundError:
@@ -78,9 +73,9 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
     """Read the settings that `Trainer` wrote: the inverse of ``dataclasses.asdict``.
 
     Args:
-        path: The ``config.json`` of a run, or another file that `read_settings` reads.
-        defaults: Settings that the file may lack, also all of the algorithm; by default, those of
-            the classes.
+        path: The ``config.json`` of a run, or another file of settings, YAML or JSON.
+        defaults: Settings that the file may lack, with the usual ones of the algorithm that the
+            file names; by default, those of the classes.
 
     Returns:
         The settings, and the digests of the encoders and demonstrations.
@@ -90,13 +85,16 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
             names a task or hyperparameters that this process does not know.
     """
     path = Path(path)
-    settings = read_settings(path)
+    settings = _read_settings(path)
     if defaults is not None:
+        name = settings.get("name", defaults.name)
+        if isinstance(name, str) and name in ALGORITHMS:
+            defaults = replace(defaults, name=name, algorithm=ALGORITHMS[name].config)
         settings = _merged(_as_json(asdict(defaults)), settings)
     try:
         digests = Digests(*(settings.pop(name, None) for name in Digests._fields))
         modules = settings.pop("task_modules", {})
-        settings.pop("scene_version", None)  # `check_settings` compares it
+        settings.pop("scene_version", None)  # `load_last` compares it
         kind = _algorithm_config(settings.get("name"), settings.pop("algorithm_class", None))
         scene = settings.get("scene", "nico")
         if scene not in SCENES:
@@ -121,18 +119,14 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
 
 
 def read_encoder_settings(path: Path, defaults: RepresentationConfig) -> RepresentationConfig:
-    """Read settings of encoders from a file that `read_settings` reads.
-
-    Args:
-        path: The file, such as one of ``vae: {steps: 2000}``.
-        defaults: Settings that the file may lack.
+    """Read settings of encoders, such as ``vae: {steps: 2000}``; the file may lack ``defaults``.
 
     Raises:
         ValueError: If the file is missing or damaged, or holds a setting unknown or out of range.
     """
     if not path.is_file():
         raise ValueError(f"there is no file of settings {path}")
-    settings = _merged(_as_json(asdict(defaults)), read_settings(path))
+    settings = _merged(_as_json(asdict(defaults)), _read_settings(path))
     try:
         return _built(RepresentationConfig, settings)
     except ValueError as error:
@@ -173,15 +167,10 @@ def _merged(defaults: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any
 
 
 def _algorithm_config(name: Any, stored: Any) -> type[AlgorithmConfig]:
-    """Return the class of an algorithm's hyperparameters.
+    """Return the class of an algorithm's hyperparameters: ``stored``, if it is imported.
 
-    Args:
-        name: Of the algorithm.
-        stored: Its name in the file; None in files without it. Only classes of modules that this
-            process has imported are found, since a file should not decide what is imported.
-
-    Raises:
-        LookupError: If it is unknown.
+    A file should not decide what is imported. Without that class, it is the class of the algorithm
+    ``name``; raise ``LookupError`` if there is none.
     """
     module, _, attribute = str(stored).rpartition(".")
     kind = getattr(sys.modules.get(module), attribute, None)

@@ -15,14 +15,10 @@ from bgpo_trl.runs.results import COLUMNS, read_table
 
 
 class CostLog:
-    """Cost of a run, kept in a file beside its checkpoints.
+    """Cost of a run, kept in a file beside its checkpoints; ``resume`` continues it if it is there.
 
     Checkpoints of equal runs are equal, and times are not: hence a file of its own. It is replaced
     as a whole with each checkpoint, so a resumed run does not count repeated steps twice.
-
-    Args:
-        path: The ``cost.csv``.
-        resume: Whether to continue the file, if there is one.
 
     Raises:
         ValueError: If the file to continue is damaged.

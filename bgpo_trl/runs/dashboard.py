@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import pandas as pd
 from torchrl.record.loggers.common import Logger
@@ -79,36 +79,20 @@ class Dashboard:
             self._episodes.append(row)
 
     def log_eval(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Log an evaluation and the training episodes before it.
-
-        Args:
-            rows: Test episodes of all seeds after the same number of training episodes, as rows of
-                ``eval.csv``.
-        """
+        """Log an evaluation of all seeds, rows of ``eval.csv``, and the training before it."""
         tests, episode = pd.DataFrame([*rows]), int(rows[0]["episode"])
         played = [row for row in self._episodes if row["episode"] <= episode]
         self._episodes = [row for row in self._episodes if row["episode"] > episode]
         self._log({**_success("eval", tests), **_training(played)}, episode)
 
     def log_final(self, tests: pd.DataFrame, episode: int) -> None:
-        """Log the tests after training.
-
-        Args:
-            tests: ``task`` and ``success`` of each seed and task, as in ``final.csv``.
-            episode: Training episodes of a seed.
-        """
+        """Log tests after the training ``episode``, rows of ``final.csv``."""
         self._log(_success("final", tests), episode)
 
     def close(self) -> None:
         """Shut the loggers down."""
         self._each(lambda logger: logger.shutdown())
         self._loggers = []
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _log(self, metrics: Mapping[str, float], episode: int) -> None:
         self._each(lambda logger: logger.log_metrics(dict(metrics), step=episode))
@@ -123,15 +107,12 @@ class Dashboard:
 
 
 def wandb_logger(
-    directory: str | os.PathLike[str], mode: Literal["online", "offline"], group: str | None = None
+    directory: str | os.PathLike[str], mode: Literal["online", "offline"], group: str
 ) -> WandbLogger:
-    """Start a run on Weights & Biases, or continue that of a run.
+    """Start a run of a group on Weights & Biases, or continue that of a run directory.
 
-    Args:
-        directory: The run directory; its ``wandb/`` gets the files, and the id of the run, by which
-            a resumed run continues its curves.
-        mode: ``"online"``, or ``"offline"`` for a later ``wandb sync``.
-        group: Group of the run.
+    The files go to its ``wandb/``, as does the id by which a resumed run continues its curves.
+    Those of the mode ``"offline"`` are for a later ``wandb sync``.
     """
     directory = Path(directory)
     identity = directory / "wandb" / "run_id"

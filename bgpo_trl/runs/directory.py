@@ -6,7 +6,7 @@ import contextlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
 from bgpo_trl.files.csv_file import CsvFile
@@ -24,21 +24,6 @@ def holds_run(directory: str | os.PathLike[str]) -> bool:
     return any((Path(directory) / name).exists() for name in names)
 
 
-def check_settings(
-    directory: str | os.PathLike[str], settings: Mapping[str, Any], *, longer: bool = False
-) -> None:
-    """Check that a directory holds no run, or one with the given settings, as JSON stores them.
-
-    With ``longer``, the existing run may have fewer ``episodes``, and lack the last tasks.
-
-    Raises:
-        ValueError: If the directory holds a run with other settings.
-    """
-    path = Path(directory) / "config.json"
-    if path.exists():
-        _compare(directory, read_json(path), settings, longer)
-
-
 def digest_of_logged(directory: Path) -> str | None:
     """Return the digest of the logged episodes that a run with a checkpoint has learned, if any."""
     path = directory / "config.json"
@@ -50,13 +35,17 @@ def digest_of_logged(directory: Path) -> str | None:
 def load_last(directory: Path, settings: Mapping[str, Any]) -> dict[str, Any] | None:
     """Read the checkpoint that a run resumes from, without changing any file.
 
+    ``settings`` are as JSON stores them. The run may have had fewer ``episodes``, and lacked the
+    last tasks.
+
     Returns:
         The state saved by `Trainer`; ``None`` if nothing has been logged yet.
 
     Raises:
         ValueError: If settings, rows or checkpoint are missing, damaged or of another run.
     """
-    check_settings(directory, settings, longer=True)
+    if (directory / "config.json").exists():
+        _compare(directory, read_json(directory / "config.json"), settings)
     tables = {name: directory / name for name in _CSV_FILES}
     if not has_checkpoint(directory / "checkpoint"):
         if any(path.exists() and path.read_bytes().count(b"\n") > 1 for path in tables.values()):
@@ -81,13 +70,13 @@ def read_checkpoint(
     state = load_checkpoint(folder, mmap=mmap, newest=newest)
     if not isinstance(state.get("settings"), dict):
         raise ValueError(f"{folder} holds no checkpoint of a run: {_REMEDY}")
-    _compare(folder, state["settings"], settings, longer=True)
+    _compare(folder, state["settings"], settings)
     return state
 
 
 @contextlib.contextmanager
 def fitting_checkpoint(directory: Path) -> Iterator[None]:
-    """Turn errors of loading a checkpoint's state, in the block, into one line."""
+    """Turn errors of loading a checkpoint's state in the block into one line."""
     try:
         yield
     except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
@@ -117,16 +106,10 @@ def differing_settings(
     ]
 
 
-def _compare(
-    where: str | os.PathLike[str],
-    saved: Mapping[str, Any],
-    settings: Mapping[str, Any],
-    longer: bool,
-) -> None:
-    """Raise ``ValueError`` if settings differ, beside length and further tasks if ``longer``."""
-    if longer:
-        saved = _as_grown(saved, settings)
-    differing = sorted(differing_settings(saved, settings), key=lambda one: one[0].count("."))
+def _compare(where: Path, saved: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
+    """Raise ``ValueError`` if settings differ, beside a larger length and further tasks."""
+    differing = differing_settings(_as_grown(saved, settings), settings)
+    differing.sort(key=lambda one: one[0].count("."))
     if differing:
         differences = [f"{name} is {old} there and {new} here" for name, old, new in differing]
         if len(differences) > _NAMED:
@@ -142,7 +125,7 @@ def _as_grown(saved: Mapping[str, Any], settings: Mapping[str, Any]) -> Mapping[
 
     Demonstrations of further tasks change the digest of the bank, which `Trainer` checks.
     """
-    grown = {}
+    grown = dict(saved)
     if type(saved.get("episodes")) is type(settings.get("episodes")) is int:
         grown["episodes"] = max(saved["episodes"], settings["episodes"])
     of_tasks = ("tasks", "task_starts")
@@ -152,7 +135,7 @@ def _as_grown(saved: Mapping[str, Any], settings: Mapping[str, Any]) -> Mapping[
         for old, new in lists
     ):
         grown |= {name: settings.get(name) for name in (*of_tasks, "bank")}
-    return {**saved, **grown}
+    return grown
 
 
 def flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -164,15 +147,25 @@ def flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         yield prefix, settings
 
 
-class RunLogger:
-    """Write the log of a run into its directory; `COLUMNS` says what the tables hold.
+@contextlib.contextmanager
+def open_tables(
+    directory: str | os.PathLike[str],
+    *,
+    config: Mapping[str, Any],
+    logged: Sequence[str] = (),
+    position: Mapping[str, int] | None = None,
+) -> Iterator[dict[str, CsvFile]]:
+    """Write the settings of a run, and hold ``train.csv`` and ``eval.csv`` open for rows.
 
     Args:
         directory: The run directory; made if missing.
         config: Settings of the run, as JSON stores them, written to ``config.json``.
-        logged: Further columns of ``train.csv``; see `Algorithm`.
-        position: To continue a run, the result of `position` in its checkpoint: later rows are
+        logged: Further columns of ``train.csv`` beside its `COLUMNS`; see `Algorithm`.
+        position: To continue a run, the position of each table in its checkpoint: later rows are
             dropped; empty to start over, for a run that ended before its first checkpoint.
+
+    Yields:
+        The tables by file name.
 
     Raises:
         ValueError: If the directory holds any run without ``position``; if its tables have other
@@ -182,57 +175,31 @@ class RunLogger:
     Examples:
         >>> import tempfile
         >>> directory = Path(tempfile.mkdtemp()) / "run"
-        >>> with RunLogger(directory, config={"gamma": 0.98}) as logger:
-        ...     logger.log_eval({"algorithm": "bgpo", "seed": 0, "episode": 1, "success": True})
+        >>> with open_tables(directory, config={"gamma": 0.98}) as tables:
+        ...     tables["eval.csv"].write({"algorithm": "bgpo", "seed": 0, "success": True})
         >>> (directory / "eval.csv").read_text().splitlines()[1]
-        'bgpo,0,1,,,1,,'
+        'bgpo,0,,,,1,,'
     """
-
-    def __init__(
-        self,
-        directory: str | os.PathLike[str],
-        *,
-        config: Mapping[str, Any],
-        logged: Sequence[str] = (),
-        position: Mapping[str, int] | None = None,
-    ) -> None:
-        directory, columns = Path(directory), (*COLUMNS["train.csv"], *logged)
-        repeated = {name for name in logged if columns.count(name) > 1}
-        if repeated:
-            raise ValueError(
-                f"train.csv has the column {', '.join(sorted(repeated))} already: choose other "
-                "names for what the algorithm logs"
-            )
-        if position is None and holds_run(directory):
-            raise ValueError(
-                f"{directory} already holds a run: resume it, or choose another run directory."
-            )
-        make_folder(directory)
-        self._train = CsvFile(directory / "train.csv", columns)
-        self._eval = CsvFile(directory / "eval.csv", COLUMNS["eval.csv"])
-        for file in (self._train, self._eval):
-            file.truncate_to((position or {}).get(file.path.name, 0))
+    directory = Path(directory)
+    columns = {name: COLUMNS[name] for name in _CSV_FILES}
+    columns["train.csv"] += tuple(logged)
+    repeated = {name for name in logged if columns["train.csv"].count(name) > 1}
+    if repeated:
+        raise ValueError(
+            f"train.csv has the column {', '.join(sorted(repeated))} already: choose other "
+            "names for what the algorithm logs"
+        )
+    if position is None and holds_run(directory):
+        raise ValueError(
+            f"{directory} already holds a run: resume it, or choose another run directory."
+        )
+    make_folder(directory)
+    with contextlib.ExitStack() as opened:
+        tables = {
+            name: opened.enter_context(CsvFile(directory / name, of_table))
+            for name, of_table in columns.items()
+        }
+        for name, table in tables.items():
+            table.truncate_to((position or {}).get(name, 0))
         write_json(directory / "config.json", config)
-
-    def log_train(self, row: Mapping[str, Any]) -> None:
-        """Write a training episode; see `CsvFile.write`."""
-        self._train.write(row)
-
-    def log_eval(self, row: Mapping[str, Any]) -> None:
-        """Write a test episode; see `CsvFile.write`."""
-        self._eval.write(row)
-
-    def position(self) -> dict[str, int]:
-        """Flush the CSV files to disk and return their sizes, for the checkpoint."""
-        return {file.path.name: file.position() for file in (self._train, self._eval)}
-
-    def close(self) -> None:
-        """Close the CSV files."""
-        self._train.close()
-        self._eval.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        yield tables

@@ -111,10 +111,9 @@ class Distinctness(NamedTuple):
 
 
 def distinctness(bank: DemonstrationBank) -> Distinctness:
-    """Measure whether encoders see the last task of a bank, of at most 300 demonstrations each.
+    """Measure whether encoders see the last of a bank's two or more tasks.
 
-    Args:
-        bank: Demonstrations of two or more tasks.
+    At most 300 demonstrations of each are compared.
     """
     last = len(bank.tasks) - 1
     rows = torch.cat([torch.nonzero(bank.task == t).flatten()[:_MOST] for t in range(last + 1)])

@@ -201,6 +201,11 @@ class Run:
         return self.config["task_starts"]
 
     @property
+    def schedule(self) -> str:
+        """By which of the presented tasks training episodes are drawn; see `RunConfig`."""
+        return self.config.get("schedule", "practised")
+
+    @property
     def presented(self) -> dict[str, int]:
         """Episode from which each task is presented, by task."""
         return dict(zip(self.tasks, self.starts, strict=True))

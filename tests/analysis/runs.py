@@ -25,13 +25,13 @@ TASKS = nico.PAPER_TASKS
 HEAD = "algorithm,seed,episode,env_steps,task,success,return,steps\n"
 
 
-def make_run(success=SUCCESS, starts=STARTS, tasks="abc", **summary):
+def make_run(success=SUCCESS, starts=STARTS, tasks="abc", *, schedule="practised", **summary):
     """Tests every 5 episodes, of success ``[S, E, T]``, or ``[E, T]`` of two equal seeds."""
     success = np.asarray(success)
     success = success if success.ndim == 3 else np.stack([success] * 2)
     seeds, episodes = range(len(success)), 5 * np.arange(1, success.shape[1] + 1)
     config = {"name": "bgpo", "task_starts": list(starts), "tasks": list(tasks), "eval_every": 5}
-    config |= {"seeds": [*seeds], "episodes": int(episodes[-1])}
+    config |= {"seeds": [*seeds], "episodes": int(episodes[-1]), "schedule": schedule}
     every = pd.MultiIndex.from_product(
         [seeds, episodes, list(tasks)], names=["seed", "episode", "task"]
     )

@@ -148,7 +148,8 @@ def test_final_tests_by_seed_and_task(tmp_path):
     ],
 )
 def test_expected_own_episodes_by_hand(starts, task, practised, expected):
-    found = expected_own_episodes(starts, task, [5, 10, 20, 30], practised=practised)
+    run = make_run(starts=starts, schedule="practised" if practised else "sequential")
+    found = expected_own_episodes(run, task, [5, 10, 20, 30])
     np.testing.assert_allclose(found, expected)
 
 
@@ -174,7 +175,8 @@ def test_forward_transfer_is_zero_for_order_independent_learning(curve):
     episodes = 5 * np.arange(1, 25)
 
     def learner(starts):
-        own = [expected_own_episodes(starts, task, episodes) for task in range(3)]
+        planned = make_run(starts=starts)
+        own = [expected_own_episodes(planned, task, episodes) for task in range(3)]
         success = [np.where(of_task > 0, curve(of_task), np.nan) for of_task in own]
         return make_run(np.stack(success, -1), starts)
 

@@ -26,16 +26,6 @@ def test_a_difference_has_welchs_intervals():
     assert found.narrow[1:] == pytest.approx(tuple(test.confidence_interval(0.90)))
 
 
-def test_a_difference_of_differences_adds_the_variances_of_four_runs():
-    runs = [FIRST, SECOND, FIRST[:4] + 0.1, SECOND[:3]]
-    value = runs[0].mean() - runs[1].mean() - (runs[2].mean() - runs[3].mean())
-    variances = np.array([run.var(ddof=1) / len(run) for run in runs])
-    freedom = variances.sum() ** 2 / (variances**2 / [len(run) - 1 for run in runs]).sum()
-    half = stats.t.ppf(0.975, freedom) * np.sqrt(variances.sum())
-    found = statistics.difference(*runs)
-    assert found.estimate == pytest.approx((value, value - half, value + half))
-
-
 def test_the_interval_of_equal_scores_is_a_point():
     found = statistics.difference([0.9, 0.9], [0.8, 0.8, 0.8])
     assert found.estimate == pytest.approx((0.1, 0.1, 0.1))

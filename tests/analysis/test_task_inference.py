@@ -47,9 +47,9 @@ SEEN = bank((0, 0), (0, 0), (0, 1), (1, 1), (1, 1), (1, 0))
 
 
 def test_matches_are_counted_by_network_node_and_task():
-    assert match_counts(network((0, 1, 2)), SEEN, 2).tolist() == [[2, 1], [1, 2], [0, 0]]
+    assert match_counts(network((0, 1, 2)), SEEN).tolist() == [[2, 1, 0], [1, 2, 0], [0, 0, 0]]
     gwr = network((0, 1, 2), (2, 1), batch_size=[2])
-    assert match_counts(gwr, SEEN, 3).tolist() == [
+    assert match_counts(gwr, SEEN).tolist() == [
         [[2, 1, 0], [1, 2, 0], [0, 0, 0]],
         [[0, 0, 0], [3, 3, 0], [0, 0, 0]],
     ]
@@ -72,7 +72,7 @@ def test_the_majority_task_without_matches_is_none_and_of_a_tie_the_first():
 )
 def test_accuracy_is_the_share_of_demonstrations_whose_node_has_their_task(tested, accuracy):
     gwr = network((0, 1, 2))
-    assert task_inference_accuracy(gwr, SEEN, bank(*tested), 2).tolist() == accuracy
+    assert task_inference_accuracy(gwr, SEEN, bank(*tested)).tolist() == accuracy
 
 
 def test_tasks_count_equally_whatever_their_number_of_demonstrations():
@@ -81,7 +81,7 @@ def test_tasks_count_equally_whatever_their_number_of_demonstrations():
     for _ in range(3):
         groups.adapt(PLACES[0])
     shown = bank(*[(0, 0)] * 9, (1, 1))
-    assert group_purity(groups, shown, 2) == 0.5
+    assert group_purity(groups, shown) == 0.5
     gwr = network((0, 1))
     both = bank(*[(0, 0)] * 9, (0, 1))
-    assert task_inference_accuracy(gwr, both, both, 2).item() == 0.5
+    assert task_inference_accuracy(gwr, both, both).item() == 0.5

@@ -14,7 +14,6 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders import pretrained
 from bgpo_trl.experiments import measure, settings
 from bgpo_trl.experiments import run as experiment
-from bgpo_trl.figures import gwr
 from bgpo_trl.policy import LoadedRun
 from suites import nico
 from suites.nico.base import STATE_CENTER, STATE_SCALE
@@ -44,11 +43,10 @@ def tiniest(tiny, monkeypatch):
         path.parent.mkdir(exist_ok=True)
         path.touch()
 
-    for module in (measure, gwr):
-        monkeypatch.setattr(module, "save_figure", touch)
-        for name in dir(module):
-            if name.startswith("plot_"):
-                monkeypatch.setattr(module, name, lambda *data, **options: None)
+    monkeypatch.setattr(measure, "save_figure", touch)
+    for name in dir(measure):
+        if name.startswith("plot_"):
+            monkeypatch.setattr(measure, name, lambda *data, **options: None)
 
 
 @pytest.fixture

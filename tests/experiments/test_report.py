@@ -83,7 +83,7 @@ def test_what_an_algorithm_knows_of_tasks_is_shown(tmp_path):
         text: replace(run, summary={"needs_label": needs, "needs_boundaries": needs})
         for text, needs in told.items()
     }
-    (section,) = success_section(Setting({**runs, "?": replace(run, summary={})}))
+    section = success_section(Setting({**runs, "?": replace(run, summary={})}))
     head, *rows = section.table
     assert [row[head.index("knows of tasks")] for row in rows] == [*runs, "?"]
 

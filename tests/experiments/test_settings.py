@@ -11,7 +11,7 @@ from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import PRESETS, RepresentationConfig
 from bgpo_trl.experiments.arguments import Arguments, EncodersArguments
 from bgpo_trl.experiments.command_line import command_line
-from bgpo_trl.experiments.settings import at_once, run_config
+from bgpo_trl.experiments.settings import run_config
 from bgpo_trl.runs.config_file import Digests, read_config, read_encoder_settings, settings_of
 from suites import nico
 
@@ -72,7 +72,8 @@ def test_tasks_start_in_their_order_at_even_intervals(tasks, episodes, starts):
     config = run_config(Arguments(tasks=tasks, episodes=episodes))
     assert config.tasks == (nico.ALL_TASKS if tasks == ("all",) else tasks)
     assert config.task_starts == starts
-    assert at_once(config).task_starts == (0,) * len(starts)
+    asked = Arguments(tasks=tasks, episodes=episodes)
+    assert run_config(asked, from_start=True).task_starts == (0,) * len(starts)
 
 
 def test_a_file_changes_the_preset_and_flags_change_the_file(tmp_path):

@@ -1,5 +1,6 @@
 """Means on dashboards, against means computed by hand; loggers that fail or are missing."""
 
+import contextlib
 import sys
 import types
 
@@ -10,7 +11,7 @@ import torch
 
 from bgpo_trl.runs import dashboard
 from bgpo_trl.runs.dashboard import Dashboard, tensorboard_logger
-from bgpo_trl.runs.directory import RunLogger
+from bgpo_trl.runs.directory import open_tables
 from bgpo_trl.runs.results import COLUMNS
 from tests.helpers import Recorder
 
@@ -55,12 +56,13 @@ def make(tmp_path):
     """Make a dashboard of a run that has the rows of its CSV files, none by default."""
 
     def make(*loggers, played=(), tested=()):
-        with RunLogger(tmp_path, config=SETTINGS, position={}) as log:
+        with open_tables(tmp_path, config=SETTINGS, position={}) as tables:
             for row in played:
-                log.log_train(row)
+                tables["train.csv"].write(row)
             for row in tested:
-                log.log_eval({name: row[name] for name in ("seed", "episode", "task", "success")})
-        return Dashboard(tmp_path, loggers, settings=SETTINGS)
+                kept = ("seed", "episode", "task", "success")
+                tables["eval.csv"].write({name: row[name] for name in kept})
+        return contextlib.closing(Dashboard(tmp_path, loggers, settings=SETTINGS))
 
     return make
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
-from bgpo_trl.runs.directory import RunLogger, check_settings
+from bgpo_trl.runs.directory import load_last, open_tables
 from bgpo_trl.runs.results import COLUMNS
 from bgpo_trl.scenes import SCENES, find_scene
 from tests.algorithms.playing import assert_same
@@ -154,17 +154,14 @@ def test_only_the_number_of_episodes_may_grow(begin, make_config, tmp_path):
     with begin(tmp_path):
         pass
     settings = json.loads((tmp_path / "config.json").read_text())
-    check_settings(tmp_path, settings)
-    longer = {**settings, "episodes": 11}
-    check_settings(tmp_path, longer, longer=True)
-    with pytest.raises(ValueError, match=r"\(episodes is 10 there and 11 here\)"):
-        check_settings(tmp_path, longer)
+    for longer in (settings, {**settings, "episodes": 11}):
+        assert load_last(tmp_path, longer) is None
     for name in ("seeds", "encoders", "name", "algorithm"):
         with pytest.raises(ValueError, match=rf"\({name}.* is .* there and other here"):
-            check_settings(tmp_path, {**settings, name: "other"}, longer=True)
+            load_last(tmp_path, {**settings, name: "other"})
     for episodes in (9, "11", True):
         with pytest.raises(ValueError, match="episodes is 10 there and"):
-            check_settings(tmp_path, {**settings, "episodes": episodes}, longer=True)
+            load_last(tmp_path, {**settings, "episodes": episodes})
 
 
 CONFIG = {"gamma": 0.98, "network": {"hidden": [64]}}
@@ -173,13 +170,13 @@ ROW = dict(zip(COLUMNS["eval.csv"], ("bgpo", 2, 7, 210, "grasp_glass", True, 1.0
 
 def test_a_run_writes_its_settings_and_two_csv_files(tmp_path):
     directory = tmp_path / "runs" / "first"
-    with RunLogger(directory, config=CONFIG) as logger:
-        logger.log_train({**ROW, "intrinsic_return": torch.tensor(0.25)})
-        logger.log_eval(ROW)
+    with open_tables(directory, config=CONFIG) as tables:
+        tables["train.csv"].write({**ROW, "intrinsic_return": torch.tensor(0.25)})
+        tables["eval.csv"].write(ROW)
         sizes = {name: (directory / name).stat().st_size for name in ("train.csv", "eval.csv")}
-        assert logger.position() == sizes
+        assert {name: table.position() for name, table in tables.items()} == sizes
         with pytest.raises(ValueError, match="loss_meta"):
-            logger.log_train({"loss_meta": 0.5})
+            tables["train.csv"].write({"loss_meta": 0.5})
     assert json.loads((directory / "config.json").read_text()) == CONFIG
     cells = "bgpo,2,7,210,grasp_glass,1,1.0,28"
     train, tests = ((directory / name).read_text().splitlines() for name in sizes)
@@ -190,5 +187,5 @@ def test_a_run_writes_its_settings_and_two_csv_files(tmp_path):
 def test_a_column_that_is_there_already_is_refused(tmp_path):
     for logged in (("success",), ("loss_meta", "loss_meta")):
         with pytest.raises(ValueError, match=logged[0]):
-            RunLogger(tmp_path / "run", config=CONFIG, logged=logged)
+            open_tables(tmp_path / "run", config=CONFIG, logged=logged).__enter__()
     assert not (tmp_path / "run").exists()
