@@ -67,15 +67,17 @@ def add_legend(above: Figure | Axes, handles: list[Any], labels: list[str], widt
 def mark_starts(axes: Axes, starts: Mapping[str, int], tasks: Sequence[str], last: int) -> None:
     """Mark the episodes from which tasks are presented with dashed lines, inside the axes.
 
-    ``starts`` are the episodes by task name; a label gives the position of its task in ``tasks``.
+    ``starts`` are the episodes by task name; a label gives the position of its task in ``tasks``,
+    which stands alone where there are many.
     The axes end at episode ``last`` and have the height 1.1 in the scale of the labels.
     """
+    prefix = "task " if len(starts) <= 6 else ""
     for task, episode in starts.items():
         if not 0 < episode < last:
             continue
         axes.axvline(episode, color="0.35", linestyle=(0, (4, 3)), linewidth=0.9)
         axes.annotate(
-            f"task {tasks.index(task) + 1}",
+            f"{prefix}{tasks.index(task) + 1}",
             (episode, 1.05 / 1.1),
             xycoords=axes.get_xaxis_transform(),
             xytext=(3, 0),
