@@ -134,3 +134,5 @@ if __name__ == "__main__":
         tyro.cli(main)
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit("interrupted: the same command continues")
