@@ -366,9 +366,11 @@ def _check_onnx() -> None:
 
 def _onnx_model(program: torch.export.ExportedProgram, about: str) -> bytes:
     """Return a program as an ONNX model, with ``about`` as its metadata ``bgpo_trl.json``."""
-    disabled = logging.root.manager.disable
+    logs = [logging.getLogger(name) for name in ("onnxscript", "torch.onnx")]
+    levels = [log.level for log in logs]
     try:
-        logging.disable(logging.WARNING)  # onnxscript reports what it leaves as it is.
+        for log in logs:
+            log.setLevel(logging.ERROR)  # They report what they leave as it is.
         with warnings.catch_warnings(action="ignore", category=FutureWarning):
             made = torch.onnx.export(
                 program,
@@ -378,7 +380,8 @@ def _onnx_model(program: torch.export.ExportedProgram, about: str) -> bytes:
                 output_names=["action"],
             )
     finally:
-        logging.disable(disabled)
+        for log, level in zip(logs, levels, strict=True):
+            log.setLevel(level)
     assert made is not None
     model: Any = made.model_proto
     model.metadata_props.add(key="bgpo_trl.json", value=about)

@@ -46,8 +46,10 @@ class Estimate(NamedTuple):
         return f" [{low:{sign}.0f}, {high:{sign}.0f}]"
 
 
-def contrast(*samples: ArrayLike, confidence: float = 0.95) -> Estimate:
-    """Return the mean of a sample ``[S]``, or that minus the mean of a second, with its t interval.
+def contrast(
+    sample: ArrayLike, minus: ArrayLike | None = None, *, confidence: float = 0.95
+) -> Estimate:
+    """Return the mean of a sample ``[S]``, or that minus the mean of another, with its t interval.
 
     The degrees of freedom are by Welch and Satterthwaite.
 
@@ -55,11 +57,12 @@ def contrast(*samples: ArrayLike, confidence: float = 0.95) -> Estimate:
         ValueError: If a sample is empty, not finite or not a vector.
     """
     value, variances, freedoms = 0.0, [], []
-    for sample, sign in zip(map(_checked, samples), (1.0, -1.0), strict=False):
-        value += sign * sample.mean()
+    for sign, scores in ((1.0, sample), *(() if minus is None else ((-1.0, minus),))):
+        checked = _checked(scores)
+        value += sign * checked.mean()
         # The variance of a single score is unknown.
-        variances.append(sample.var(ddof=1) / len(sample) if len(sample) > 1 else math.nan)
-        freedoms.append(len(sample) - 1)
+        variances.append(checked.var(ddof=1) / len(checked) if len(checked) > 1 else math.nan)
+        freedoms.append(len(checked) - 1)
     error = math.sqrt(sum(variances))
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = np.square(variances) / freedoms

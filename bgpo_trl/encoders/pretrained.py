@@ -36,7 +36,11 @@ def load_pretrained(
     scene = find_scene(scene)
     weights = default_weights(tasks, scene=scene) if weights is None else Path(weights)
     encoders = load_representation(weights, scene=scene)
-    return encoders, DemonstrationBank.load(bank_path(weights), encoder_id=encoders.identity)
+    path = bank_path(weights)
+    bank = DemonstrationBank.load(path, encoder_id=encoders.identity)
+    if bank.scene is not None:
+        scene.check_identity(bank.scene, path, "record and embed demonstrations of this scene")
+    return encoders, bank
 
 
 def default_weights(tasks: Sequence[str] | None = None, *, scene: Scene | str = "nico") -> Path:

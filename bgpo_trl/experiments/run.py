@@ -112,6 +112,7 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
             changed = changed_hyperparameters(config)
             summary = {**code, "changed": changed, **measure(trainer, bank, out)}
             lines = draw(trainer, bank, out, summary)
+            # Written last, as the mark of a complete run.
             write_json(out / "summary.json", summary)
     lines += [verdict] if verdict else []
     if arguments.train_encoders:
