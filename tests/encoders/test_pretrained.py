@@ -104,6 +104,9 @@ def test_files_that_do_not_belong_together_are_refused(made, copy, monkeypatch):
             ValueError, match=r"is of the scene nico nico-2.*this is nico another: train some"
         ):
             load_pretrained(copy)
+    replace(made[1], scene="nico mars-1").save(copy.with_name("some_bank.safetensors"))
+    with pytest.raises(ValueError, match=r"some_bank\.safetensors is of the scene nico mars-1"):
+        load_pretrained(copy)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(5)
         other = replace(made[0], lae=SequenceAutoencoder())
