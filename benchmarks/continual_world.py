@@ -86,6 +86,7 @@ def main(
     demonstrations: int = 30,
     episodes: int = 300,
     encoder_tasks: int = 10,
+    joints: bool = False,
     small: bool = False,
 ) -> None:
     """Learn Continual World's ten tasks, one after the other.
@@ -97,6 +98,8 @@ def main(
         demonstrations: Demonstrations of each task in training.
         episodes: Training episodes of each task.
         encoder_tasks: Number of tasks, from the first on, whose demonstrations encoders see.
+        joints: Whether policies and critics read the hand's position and the gripper's opening
+            beside frames. Such runs have a bank of their own: give them a folder of their own.
         small: One seed of bgpo and clone, 20 episodes of each task, and encoders trained a tenth
             as long. It shows that all parts work, not what can be learned.
     """
@@ -117,6 +120,7 @@ def main(
             episodes=episodes * len(tasks),
             out=folder / f"run-{algorithm}",
             resume=True,
+            settings=("--algorithm.joints",) if joints else (),
         )
         changes = {
             "seeds": seeds,

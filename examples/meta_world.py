@@ -151,6 +151,10 @@ class MetaWorld(Simulation):
         """Return position of the hand (m), opening of the gripper, position of the object (m)."""
         return self.observation[:7]
 
+    def joints(self) -> NDArray[Any]:
+        """Return position of the hand (m) and opening of the gripper, which a real arm knows."""
+        return self.observation[:4]
+
     def save(self) -> dict[str, Any]:
         """Return what the episode depends on, from which it can be played again."""
         actions = [list(action) for action in self._actions]
@@ -187,6 +191,7 @@ def make_env(tasks: Sequence[str], **arguments: Any) -> SimulationEnv:
     return SimulationEnv(partial(MetaWorld, {}), tasks, **arguments)
 
 
+CENTER, SCALE = (0.0, 0.65, 0.2, 0.7, 0.0, 0.8, 0.12), (0.1, 0.1, 0.1, 0.3, 0.1, 0.1, 0.08)
 METAWORLD = SCENES["metaworld"] = Scene(
     name="metaworld",
     version=f"1-metaworld-{version('metaworld')}",
@@ -197,9 +202,6 @@ METAWORLD = SCENES["metaworld"] = Scene(
     action_size=4,
     rate=20.0,
     demonstrator=demonstrator,
-    state=StateColumns(
-        center=(0.0, 0.65, 0.2, 0.7, 0.0, 0.8, 0.12),
-        scale=(0.1, 0.1, 0.1, 0.3, 0.1, 0.1, 0.08),
-        places={"hand": (0, 1, 2), "object": (4, 5, 6)},
-    ),
+    state=StateColumns(center=CENTER, scale=SCALE, places={"hand": (0, 1, 2), "object": (4, 5, 6)}),
+    joints=StateColumns(center=CENTER[:4], scale=SCALE[:4]),
 )
