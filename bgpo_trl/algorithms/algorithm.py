@@ -417,8 +417,30 @@ class Algorithm(ABC):
             batch = {key: torch.cat([entry, shown[key]], 2) for key, entry in played.items()}
         if self.config.rl.imitates:
             imitated = self.shown.draw_actions(groups(n_rows), generator=generator)
+            n_own = round(self.config.rl.success_share * n_rows)
+            if n_own and len(self.replay):
+                self._imitate_successes(imitated, groups(n_own), generator)
             batch |= {("imitation", key): entry for key, entry in imitated.items()}
         return TensorDict(batch, batch["priority_weight"].shape)
+
+    def _imitate_successes(
+        self,
+        imitated: dict[NestedKey, Tensor],
+        group: Tensor,
+        generator: Sequence[torch.Generator] | None,
+    ) -> None:
+        """Put own successes, with noise on their states, in place of the first of the rows.
+
+        Rows stay as they are where a group ``[S, E, n]`` has no success.
+        """
+        assert self.shown is not None
+        keys, n_rows = [*imitated.keys() - {"priority_weight"}], group.shape[-1]
+        own = self.replay.draw(group, generator=generator, keys=keys, successes=True)
+        own[self.config.observed] = self.shown.blur(own[self.config.observed], group, generator)
+        known = own["priority_weight"] > 0
+        for key in keys:
+            entry = imitated[key][:, :, :n_rows]
+            imitated[key][:, :, :n_rows] = torch.where(known.unsqueeze(-1), own[key], entry)
 
     def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Take a gradient step on a batch and update the targets; return the losses of `update`."""

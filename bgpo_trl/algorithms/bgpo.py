@@ -96,6 +96,7 @@ class BGPO(Algorithm):
             source_key="demo_index" if config.grouped else None,
             n_steps=rl.n_steps,
             gamma=rl.gamma,
+            success_key=("next", "terminated"),
         )
         self.shown = self.demonstrations(keys[1:], own_constants=not config.experts)
         self.starts: Tensor | None = None

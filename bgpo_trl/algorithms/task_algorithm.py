@@ -44,6 +44,7 @@ class TaskAlgorithm(Algorithm):
             keys=self.replay_keys(),
             n_steps=config.rl.n_steps,
             gamma=config.rl.gamma,
+            success_key=("next", "terminated"),
         )
         self.shown = self.demonstrations()
         self._tasks = torch.arange(self.n_tasks).expand(self.n_seeds, -1)

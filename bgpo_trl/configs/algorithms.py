@@ -48,6 +48,9 @@ class RLConfig(Settings):
     keeps the actor useful while critics know little (docs/learning.md)."""
     imitation_half_life: float | None = None
     """Updates of an actor in which the weight of imitation halves; None for never."""
+    success_share: float = 0.0
+    """Share of the imitated states and actions that are of own episodes which succeeded, once a
+    group has some; the others are demonstrated. Ours."""
     hidden_sizes: tuple[int, ...] = (256, 256)
     """Hidden layers of actor and critic. Ours: the 64 units of Sec. IV-A limit the success, and a
     second layer helps to read places from latents (docs/learning.md)."""
@@ -107,6 +110,7 @@ class RLConfig(Settings):
             ("tau", 0 < self.tau <= 1, "above 0 and at most 1"),
             ("replay_size", self.replay_size >= least, f"{least} (batch, warm-up) or more"),
             ("clone_share", 0 <= self.clone_share < 1, "at least 0 and below 1"),
+            ("success_share", 0 <= self.success_share < 1, "at least 0 and below 1"),
         )
 
     @property

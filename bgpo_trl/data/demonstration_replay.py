@@ -130,9 +130,14 @@ class DemonstrationReplay:
         """Draw latents, with noise, and actions to imitate: as `draw`, without ``"next"``."""
         sources = self._generators if generator is None else generator
         entries, _, frame, _ = self._draw_frames(group, sources)
-        state = self._states(frame)
-        drawn = draw_for_rows(torch.randn, group, sources, state.shape[-1])
-        return {**entries, self._key: state + self.noise * drawn}
+        return {**entries, self._key: self.blur(self._states(frame), group, sources)}
+
+    def blur(
+        self, state: Tensor, group: Tensor, generator: Sequence[torch.Generator] | None = None
+    ) -> Tensor:
+        """Return states to imitate ``[S, *R, features]`` of rows ``[S, *R]`` with noise."""
+        sources = self._generators if generator is None else generator
+        return state + self.noise * draw_for_rows(torch.randn, group, sources, state.shape[-1])
 
     def _states(self, frame: Tensor) -> Tensor:
         """Return what policies read of frames int64 ``[...]``, float32 ``[..., features]``."""

@@ -38,6 +38,8 @@ class GroupReplay:
         n_steps: Largest number of steps of a drawn transition; above 1, ``("next", "done")`` must
             be stored.
         gamma: Discount of the rewards of these steps.
+        success_key: Entry, bool ``[S, 1]``, that is true in the last transition of an episode that
+            succeeded; only ``successes`` of `draw` needs it. ``("next", "done")`` must be stored.
 
     Raises:
         ValueError: If ``capacity`` or the number of generators is not positive.
@@ -60,8 +62,10 @@ class GroupReplay:
         source_key: NestedKey | None = None,
         n_steps: int = 1,
         gamma: float = 1.0,
+        success_key: NestedKey | None = None,
     ) -> None:
         self.capacity, self.n_steps, self.gamma = capacity, n_steps, gamma
+        self._success_key = success_key
         self._generators = list(generator)
         self._keys, self._source_key = list(keys), source_key
         n_seeds = len(self._generators)
@@ -75,6 +79,8 @@ class GroupReplay:
         # one block and a row has a single index, for which torch has its fastest kernels.
         self._rows: dict[Any, Tensor] = {_GROUP: self._allocate(torch.Size(), torch.int64)}
         self._index = [_GroupIndex() for _ in self._generators]
+        self._won = [_GroupIndex() for _ in self._generators]  # steps of successful episodes
+        self._began = [0] * n_seeds  # first step of each seed's present episode
 
     def __len__(self) -> int:
         """Return the smallest number of transitions held for a seed."""
@@ -116,6 +122,21 @@ class GroupReplay:
         for seed in seeds:
             self._index[seed].append(numbers[seed], self._n_added[seed])
             self._n_added[seed] += 1
+        if self._success_key is not None:
+            self._index_successes(entries, seeds, numbers)
+
+    def _index_successes(
+        self, entries: Mapping[Any, Tensor], seeds: Sequence[int], numbers: Sequence[int]
+    ) -> None:
+        """Index the steps of the episodes that end with a success; others begin anew."""
+        won = entries[self._success_key].flatten().tolist()
+        done = entries["next", "done"].flatten().tolist()
+        for seed in seeds:
+            if won[seed]:
+                for step in range(self._began[seed], self._n_added[seed]):
+                    self._won[seed].append(numbers[seed], step)
+            if done[seed]:
+                self._began[seed] = self._n_added[seed]
 
     def sample(
         self,
@@ -153,14 +174,19 @@ class GroupReplay:
         seeds: Sequence[int] | None = None,
         generator: Sequence[torch.Generator] | None = None,
         keys: Collection[NestedKey] | None = None,
+        successes: bool = False,
     ) -> dict[NestedKey, Tensor]:
-        """Return the entries of `sample` by key, or only some of them, without a TensorDict."""
+        """Return the entries of `sample` by key, or only some of them, without a TensorDict.
+
+        With ``successes``, transitions are drawn from episodes that have succeeded alone.
+        """
         seeds = range(len(self._generators)) if seeds is None else seeds
         empty = [i for i, seed in enumerate(seeds) if not self._n_added[seed]]
         if empty and group[empty].ge(0).any():
             raise ValueError("every seed needs a transition before the first sample")
         sources = [self._generators[seed] for seed in seeds] if generator is None else generator
-        steps, weight = self._located(group.flatten(1), seeds, sources)
+        index = self._won if successes else self._index
+        steps, weight = self._located(group.flatten(1), seeds, sources, index)
         first = rows = self._rows_of(steps, seeds)
         drawn: dict[NestedKey, Tensor] = {}
         if self.n_steps > 1:
@@ -232,7 +258,11 @@ class GroupReplay:
         return drawn
 
     def _located(
-        self, group: Tensor, seeds: Sequence[int], sources: Sequence[torch.Generator]
+        self,
+        group: Tensor,
+        seeds: Sequence[int],
+        sources: Sequence[torch.Generator],
+        index: Sequence[_GroupIndex],
     ) -> tuple[NDArray[np.int64], Tensor]:
         """Draw a step for each row ``[S, R]``; return the steps and the weights, ``[S, R]``."""
         shares_of_all = draw_for_rows(torch.rand, group, sources, dtype=torch.float64).numpy()
@@ -242,7 +272,7 @@ class GroupReplay:
             numbers = {*wanted[i].tolist()}
             for number in numbers:
                 rows = slice(None) if len(numbers) == 1 else wanted[i] == number
-                held = self._index[seed].steps_of(number, oldest[seed])
+                held = index[seed].steps_of(number, oldest[seed])
                 if len(held):
                     steps[i, rows] = held[(shares[rows] * len(held)).astype(np.int64)]
                 else:
@@ -272,12 +302,12 @@ class GroupReplay:
         rows = self._held(seed)
         if len(rows):
             self._rows[_GROUP][rows] = group[self._rows[self._source_key][rows]]
-            self._index[seed] = self._indexed(seed)
+            self._index_anew(seed)
 
     def clear(self, seed: int) -> None:
         """Discard the transitions of a seed, given its position."""
-        self._n_added[seed] = 0
-        self._index[seed] = _GroupIndex()
+        self._n_added[seed] = self._began[seed] = 0
+        self._index[seed], self._won[seed] = _GroupIndex(), _GroupIndex()
 
     def state_dict(self) -> dict[str, Any]:
         """Return the filled part of the buffer (a copy) and the states of the generators."""
@@ -317,7 +347,8 @@ class GroupReplay:
         self._n_added = n_added.tolist()
         for generator, state in zip(self._generators, state_dict["generators"], strict=True):
             generator.set_state(state.clone())
-        self._index = [self._indexed(seed) for seed in range(len(self._generators))]
+        for seed in range(len(self._generators)):
+            self._index_anew(seed)
 
     def _oldest(self) -> list[int]:
         """Return the step of the oldest transition held for each seed, counted from 0."""
@@ -329,11 +360,23 @@ class GroupReplay:
         steps = torch.arange(max(0, end - self.capacity), end)
         return steps % self.capacity * len(self._generators) + seed
 
-    def _indexed(self, seed: int) -> _GroupIndex:
-        """Return the index of what the buffer holds of a seed."""
-        index = _GroupIndex()
-        index.extend(self._rows[_GROUP][self._held(seed)].numpy(), self._oldest()[seed])
-        return index
+    def _index_anew(self, seed: int) -> None:
+        """Index what the buffer holds of a seed."""
+        rows, oldest = self._held(seed), self._oldest()[seed]
+        self._index[seed], self._won[seed] = _GroupIndex(), _GroupIndex()
+        if not len(rows):
+            return
+        groups = self._rows[_GROUP][rows].numpy()
+        self._index[seed].extend(groups, oldest)
+        if self._success_key is not None:
+            done, won = (
+                self._rows[key][rows].flatten().numpy()
+                for key in (("next", "done"), self._success_key)
+            )
+            episode = np.cumsum(done) - done
+            in_success = np.isin(episode, episode[won])
+            self._won[seed].extend(np.where(in_success, groups, -1), oldest)
+            self._began[seed] = int(oldest + np.flatnonzero(done).max(initial=-1) + 1)
 
     def _checked(
         self, transition: TensorDictBase, numbers: Sequence[int], mask: Tensor | None
@@ -413,8 +456,8 @@ class _GroupIndex:
         self._span[group] = first, end + 1
 
     def extend(self, groups: NDArray[np.int64], first: int) -> None:
-        """Append the steps from ``first`` on, of these groups, to an empty index."""
-        for group in np.unique(groups).tolist():
+        """Append the steps from ``first`` on, of these groups (-1 for none), to an empty index."""
+        for group in np.unique(groups[groups >= 0]).tolist():
             steps = self._steps[group] = first + np.flatnonzero(groups == group)
             self._span[group] = 0, len(steps)
 
