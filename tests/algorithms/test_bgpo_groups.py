@@ -134,6 +134,33 @@ def test_an_update_sees_as_much_of_each_group_played_last(make_bgpo, bank, varia
     assert n_full > 20
 
 
+def test_own_successes_of_the_group_are_a_share_of_what_is_imitated(make_bgpo, bank):
+    """Where a group has none yet, all is demonstrated."""
+    rl = replace(make_bgpo("all").config.rl, success_share=0.25)
+    algorithm = make_bgpo("all", schedule=TaskSchedule((0, 0, 0)), known=15, rl=rl)
+    batches, actives = spy_batches(algorithm), []
+    data, _ = play(algorithm, 60, watch=lambda _: actives.append(algorithm.active.group))
+    frames = bank.seen().steps.latents(torch.arange(len(bank.seen().steps.latent)))
+    episode = data["next", "done"].squeeze(-1).cumsum(1) - data["next", "done"].squeeze(-1).int()
+    n_own, n_lacking = 0, 0
+    for step, batch in enumerate(batches, 60 - len(batches)):
+        for seed in range(2):
+            won = episode[seed, :step][data["next", "terminated"][seed, :step, 0]]
+            succeeded = torch.isin(episode[seed, :step], won)
+            for place, group in enumerate(actives[step][seed].tolist()):
+                imitated = batch["imitation"][seed, place]
+                if group < 0 or not bool((imitated["priority_weight"] > 0).all()):
+                    continue
+                rows = imitated["latent"].unsqueeze(1)
+                of_group = succeeded & (data["group"][seed, :step] == group)
+                own = (rows == data["latent"][seed, :step][of_group]).all(-1).any(-1)
+                demonstrated = (rows == frames).all(-1).any(-1)
+                n = 2 if of_group.any() else 0
+                assert own[:n].all() and demonstrated[n:].all()
+                n_own, n_lacking = n_own + n, n_lacking + (n == 0)
+    assert n_own > 20 and n_lacking > 2
+
+
 def test_what_is_stored_is_of_the_group_that_its_demonstration_has_today(make_bgpo, bank):
     """Groups split while they are played."""
     algorithm = make_bgpo("all", schedule=TaskSchedule((0, 0, 0)), known=9)

@@ -134,6 +134,58 @@ def test_a_transition_of_several_steps_is_a_plain_walk(capacity, n_steps, played
             assert row["next", "done"].item() == last[5]
 
 
+@settings(max_examples=60)
+@given(
+    capacity=st.integers(1, 12),
+    played=st.lists(
+        st.tuples(st.integers(0, 2), st.sampled_from(["goes on", "fails", "succeeds"])),
+        min_size=1,
+        max_size=40,
+    ),
+    restored=st.integers(0, 40),
+    regrouped=st.booleans(),
+)
+def test_successes_are_the_steps_of_episodes_that_ended_with_one(
+    capacity, played, restored, regrouped
+):
+    """Against a plain walk; also of a replay that is restored within an episode, or regrouped."""
+
+    def empty():
+        return GroupReplay(
+            capacity,
+            generator=generators(1),
+            keys=["latent", ("next", "done"), ("next", "terminated")],
+            source_key="source",
+            success_key=("next", "terminated"),
+        )
+
+    replay, kept, episode = empty(), [], []
+    for step, (group, outcome) in enumerate(played):
+        if step == restored:
+            state, replay = through_a_file(replay.state_dict()), empty()
+            replay.load_state_dict(state)
+        won, done = torch.tensor([[outcome == "succeeds"]]), torch.tensor([[outcome != "goes on"]])
+        moment = {"latent": torch.tensor([[step]]), "source": torch.tensor([group])}
+        after = {"done": done, "terminated": won}
+        replay.add(TensorDict({**moment, "next": after}, [1]), torch.tensor([group]))
+        episode.append((group, step))
+        if done:
+            kept += episode * bool(won)
+            episode = []
+    if regrouped:
+        replay.regroup(0, torch.tensor([2, 0, 0]))
+        kept = [([2, 0, 0][group], step) for group, step in kept]
+    held = {step for _, step in kept if step >= len(played) - capacity}
+    for group in range(3):
+        drawn = replay.draw(torch.full((1, 60), group), successes=True)
+        expected = {step for number, step in kept if number == group and step in held}
+        weighed = drawn["priority_weight"][0] > 0
+        assert weighed.all() == weighed.any() == bool(expected)
+        assert {*drawn["latent"][0, weighed, 0].tolist()} <= expected
+    replay.clear(0)
+    assert len(replay) == 0
+
+
 def test_the_latest_transitions_of_a_group_and_their_weights_by_hand():
     replay = make(capacity=5)
     fill(replay, [(0, 1), (0, 1), (1, 1), (0, 0), (0, 1), (1, 1), (0, 0)])  # the last five are left
