@@ -69,7 +69,7 @@ def bank_path(weights: Path) -> Path:
 
 def find_weights(identity: str | None, scene: Scene | str = "nico") -> Path | None:
     """Return the path of the encoders with an identity that come with a scene; None if none do."""
-    files = find_scene(scene).weights
+    files = [path for path in find_scene(scene).weights if path.exists()]
     return next((path for path in files if identity == _identity(path)), None)
 
 
@@ -86,6 +86,6 @@ def weights_of_bank(bank: Path, scene: Scene | str = "nico") -> Path:
 
 
 @cache
-def _identity(path: Path) -> str | None:
-    """Return the identity of shipped encoders; None if they are not there."""
-    return load_representation(path).identity if path.exists() else None
+def _identity(path: Path) -> str:
+    """Return the identity of shipped encoders."""
+    return load_representation(path).identity

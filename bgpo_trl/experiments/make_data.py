@@ -24,11 +24,14 @@ from bgpo_trl.runs.provenance import command
 from bgpo_trl.scenes import Scene, find_scene
 
 
-def record(arguments: RecordArguments) -> None:
+def record(arguments: RecordArguments) -> str:
     """Record demonstrations, or random play; see `record_demonstrations`."""
     options = {name: value for name, value in vars(arguments).items() if name != "module"}
     options["tasks"] = chosen_tasks(arguments.tasks, find_scene(arguments.scene))
-    record_demonstrations(**options)
+    recorded = record_demonstrations(**options)
+    what = "episodes of play" if arguments.play else "demonstrations"
+    n_held_out = int((~recorded["train"]).sum())
+    return f"{len(recorded)} {what}, {n_held_out} of them held out: {arguments.path}"
 
 
 def encoders(arguments: EncodersArguments) -> str:
@@ -61,7 +64,7 @@ def _play(path: Path | None, scene: Scene) -> TensorDict | None:
     return load_demonstrations(path)
 
 
-def bank(arguments: MakeBankArguments) -> None:
+def bank(arguments: MakeBankArguments) -> str:
     """Embed a recorded dataset with trained encoders; see `make_bank`."""
     meta = read_meta(arguments.dataset)
     scene = find_scene(meta["scene"])
@@ -74,6 +77,8 @@ def bank(arguments: MakeBankArguments) -> None:
         spread=meta["spread"],
     )
     made.save(arguments.out)
+    n_held_out = int((~made.train).sum())
+    return f"{len(made.task)} demonstrations, {n_held_out} of them held out: {arguments.out}"
 
 
 def probes(arguments: ProbesArguments) -> str:

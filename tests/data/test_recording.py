@@ -156,7 +156,8 @@ def test_wrong_arguments_are_refused_before_anything_is_written(tmp_path, wrong,
     assert not (tmp_path / "new").exists()
 
 
-def test_the_command_records_all_tasks_by_one_word(tmp_path):
-    record(RecordArguments(path=tmp_path, tasks=("all",), per_task=1, held_out_per_task=0))
+def test_the_command_records_all_tasks_by_one_word_and_says_what_it_made(tmp_path):
+    said = record(RecordArguments(path=tmp_path, tasks=("all",), per_task=1, held_out_per_task=0))
 
     assert read_meta(tmp_path)["tasks"] == list(nico.ALL_TASKS)
+    assert said == f"8 demonstrations, 0 of them held out: {tmp_path}"
