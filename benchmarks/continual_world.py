@@ -87,6 +87,7 @@ def main(
     episodes: int = 300,
     encoder_tasks: int = 10,
     joints: bool = False,
+    successes: float = 0.5,
     small: bool = False,
 ) -> None:
     """Learn Continual World's ten tasks, one after the other.
@@ -100,6 +101,8 @@ def main(
         encoder_tasks: Number of tasks, from the first on, whose demonstrations encoders see.
         joints: Whether policies and critics read the hand's position and the gripper's opening
             beside frames. Such runs have a bank of their own: give them a folder of their own.
+        successes: Share of own successes in what `bgpo` and other learners from demonstrations
+            imitate (`success_share`); the clone imitates demonstrations alone.
         small: One seed of bgpo and clone, 20 episodes of each task, and encoders trained a tenth
             as long. It shows that all parts work, not what can be learned.
     """
@@ -120,7 +123,7 @@ def main(
             episodes=episodes * len(tasks),
             out=folder / f"run-{algorithm}",
             resume=True,
-            settings=("--algorithm.joints",) if joints else (),
+            settings=_settings(algorithm, joints, successes),
         )
         changes = {
             "seeds": seeds,
@@ -131,6 +134,13 @@ def main(
         }
         print(run_experiment(arguments, "cw10", run_config(arguments, changes=changes)))
     print(report(ReportArguments(runs=(folder,))))
+
+
+def _settings(algorithm: str, joints: bool, successes: float) -> tuple[str, ...]:
+    flags = ["--algorithm.joints"] if joints else []
+    if algorithm == "bgpo" or algorithm.endswith("-demonstrations"):
+        flags.append(f"--algorithm.rl.success-share={successes}")
+    return tuple(flags)
 
 
 if __name__ == "__main__":

@@ -38,6 +38,7 @@ BAD = {
         "n_steps": 0,
         "policy_delay": 0,
         "clone_share": 1.0,
+        "success_share": 0.5,
     },
     AlgorithmConfig: {"state": "pixels", "max_steps": 0, "demonstration_share": 1.0},
     GWRBConfig: {

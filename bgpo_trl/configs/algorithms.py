@@ -111,6 +111,7 @@ class RLConfig(Settings):
             ("replay_size", self.replay_size >= least, f"{least} (batch, warm-up) or more"),
             ("clone_share", 0 <= self.clone_share < 1, "at least 0 and below 1"),
             ("success_share", 0 <= self.success_share < 1, "at least 0 and below 1"),
+            ("success_share", self.imitates or not self.success_share, "0 without imitation"),
         )
 
     @property
