@@ -123,18 +123,20 @@ class GroupReplay:
             self._index[seed].append(numbers[seed], self._n_added[seed])
             self._n_added[seed] += 1
         if self._success_key is not None:
-            self._index_successes(entries, seeds, numbers)
+            self._index_successes(entries, seeds)
 
-    def _index_successes(
-        self, entries: Mapping[Any, Tensor], seeds: Sequence[int], numbers: Sequence[int]
-    ) -> None:
+    def _index_successes(self, entries: Mapping[Any, Tensor], seeds: Sequence[int]) -> None:
         """Index the steps of the episodes that end with a success; others begin anew."""
         won = entries[self._success_key].flatten().tolist()
         done = entries["next", "done"].flatten().tolist()
         for seed in seeds:
             if won[seed]:
-                for step in range(self._began[seed], self._n_added[seed]):
-                    self._won[seed].append(numbers[seed], step)
+                oldest = max(0, self._n_added[seed] - self.capacity)
+                steps = np.arange(max(self._began[seed], oldest), self._n_added[seed])
+                # A transition's own group: it may have been assigned anew since.
+                groups = self._rows[_GROUP][self._rows_of(steps[None], [seed])]
+                for group, step in zip(groups.tolist(), steps.tolist(), strict=True):
+                    self._won[seed].append(group, step)
             if done[seed]:
                 self._began[seed] = self._n_added[seed]
 
