@@ -51,7 +51,7 @@ _OF_TASKS: Any = {**_LITERAL, "task_batch_size": 256, "share_batch": True}
 _SHOWN: Any = {"demonstration_share": 0.5, "rl": SHOWN}
 _SHOWN_TASKS: Any = {**_SHOWN, "task_batch_size": 128}
 _SHOWN_SINGLE: Any = {**_SHOWN, "rl": replace(SHOWN, batch_size=384)}  # of three tasks
-_CLONE: Any = {"rl": replace(SHOWN, proposals="clone")}
+_CLONE: Any = {"rl": replace(SHOWN, proposals="clone", success_share=0.0)}
 # MAML adapts one policy, which imitates and ascends its critics at once. Imitation makes the
 # gradient by which it adapts as much larger.
 _MAML: Any = {

@@ -125,6 +125,7 @@ SHOWN = RLConfig(
     n_steps=3,
     imitation=0.2,
     imitation_half_life=5_000.0,
+    success_share=0.5,
     hidden_sizes=(128, 128),
     learning_rate=3e-4,
     gamma=0.98,
