@@ -16,6 +16,7 @@ from pathlib import Path
 
 import tyro
 
+from bgpo_trl.algorithms import entry
 from bgpo_trl.configs import (
     InverseModelConfig,
     RepresentationConfig,
@@ -138,7 +139,7 @@ def main(
 
 def _settings(algorithm: str, joints: bool, successes: float) -> tuple[str, ...]:
     flags = ["--algorithm.joints"] if joints else []
-    if algorithm == "bgpo" or algorithm.endswith("-demonstrations"):
+    if entry(algorithm).config.rl.imitates and algorithm != "clone":
         flags.append(f"--algorithm.rl.success-share={successes}")
     return tuple(flags)
 

@@ -5,9 +5,12 @@ It observes Meta-World's ground truth of 39 numbers, or the first 64 principal c
 frames of all tasks, which take seconds instead of the VAE's hours. Groups form from embeddings of
 sequences of these components.
 
-    python benchmarks/studies/cw10_limits.py truth
-    python benchmarks/studies/cw10_limits.py frames --folder runs/cw10/demonstrations
-    python benchmarks/studies/cw10_limits.py groups --folder runs/cw10/demonstrations
+    python -m benchmarks.studies.cw10_limits truth
+    python -m benchmarks.studies.cw10_limits frames --folder runs/cw10/demonstrations
+    python -m benchmarks.studies.cw10_limits groups --folder runs/cw10/demonstrations
+    python -m benchmarks.studies.cw10_limits replay --folder runs/cw10/demonstrations
+
+`replay` sees nothing: it repeats the actions of a demonstration of the task, from the new starts.
 
 The folder is that of `benchmarks/continual_world.py`; demonstrations are recorded if missing.
 """
@@ -16,6 +19,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -148,6 +152,19 @@ def clone_of_frames(
     return success(task, policy, observe)
 
 
+def success_of_replay(task: str, dataset: TensorDictBase) -> float:
+    """Return the success of the actions of demonstrations, a different one from each new start."""
+    rows = (dataset["task"] == CW10.index(task)) & dataset["train"]
+    simulation = ContinualWorld({})
+    simulation.seed(12_345)
+    won = 0
+    for actions in dataset["action"][rows][:TESTS].double():
+        simulation.reset(task)
+        turn = iter(actions.numpy())
+        won += perform(simulation, partial(next, turn), truth)[2]
+    return won / TESTS
+
+
 def embed(dataset: TensorDictBase, encode: Callable[[Tensor], Tensor], seed: int) -> Tensor:
     """Return the embedding of each demonstration, ``[N, 32]``."""
     length, train = dataset["length"], dataset["train"]
@@ -186,14 +203,14 @@ def print_groups(dataset: TensorDictBase, encode: Callable[[Tensor], Tensor]) ->
 
 
 def main(
-    what: tyro.conf.Positional[Literal["truth", "frames", "groups"]],
+    what: tyro.conf.Positional[Literal["truth", "frames", "groups", "replay"]],
     folder: Path = Path("runs/cw10/demonstrations"),
     tasks: tuple[str, ...] = CW10,
 ) -> None:
     """Measure what limits clones and groups.
 
     Args:
-        what: What clones observe, or groups.
+        what: What clones observe, or groups, or the replay of actions.
         folder: Folder of the demonstrations.
         tasks: Tasks to clone.
     """
@@ -206,6 +223,10 @@ def main(
         folder, scene="cw10", per_task=SHOWN + HELD_OUT, held_out_per_task=HELD_OUT
     )
     dataset = recorded.clone()
+    if what == "replay":
+        for task in tasks:
+            print(task, success_of_replay(task, dataset), flush=True)
+        return
     encode = components(dataset)
     if what == "groups":
         print_groups(dataset, encode)

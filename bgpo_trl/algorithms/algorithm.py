@@ -327,11 +327,28 @@ class Algorithm(ABC):
                 demonstration=int(transition["demo_index"][seed]),
             )
 
-    def replay_keys(self, constant_keys: Sequence[NestedKey] = ()) -> list[NestedKey]:
-        """Return the entries of a transition to store, of which some are constant in an episode."""
-        seen = self.config.observed
+    def make_replay(
+        self, constant_keys: Sequence[NestedKey] = (), source_key: NestedKey | None = None
+    ) -> GroupReplay:
+        """Return the replay of training episodes.
+
+        Args:
+            constant_keys: Policies' inputs that are constant in an episode.
+            source_key: See `GroupReplay`.
+        """
+        rl, seen = self.config.rl, self.config.observed
         following = [("next", key) for key in (seen, "reward", "terminated", "done")]
-        return [seen, *constant_keys, "action", *following]
+        # A failure, such as a fall, terminates an episode too.
+        success_key = ("next", "success") if rl.success_share else None
+        return GroupReplay(
+            rl.replay_size,
+            generator=generators(self.seeds, "replay"),
+            keys=[seen, *constant_keys, "action", *following],
+            source_key=source_key,
+            n_steps=rl.n_steps,
+            gamma=rl.gamma,
+            success_key=success_key,
+        )
 
     def policy(
         self,

@@ -16,7 +16,6 @@ from bgpo_trl.algorithms.rl import Learner, LearnerSpec, make_learner
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationSteps
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
-from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.seeding import generators, stream_seed
@@ -71,7 +70,7 @@ class BGPO(Algorithm):
         context_size = sizes.get(config.context, embedding_size)
         self.in_keys = [config.observed, *(["context"] if context_size else [])]
 
-        rl, keys = config.rl, self.in_keys
+        keys = self.in_keys
         spec = LearnerSpec(
             seeds=seeds,
             in_keys=keys,
@@ -89,15 +88,8 @@ class BGPO(Algorithm):
                 self.learner, self.active, lambda seed, group: self.groups[seed].parent[group]
             )
         self.test_actor = self.learner.policy
-        self.replay = GroupReplay(
-            rl.replay_size,
-            generator=generators(seeds, "replay"),
-            keys=self.replay_keys(keys[1:]),
-            source_key="demo_index" if config.grouped else None,
-            n_steps=rl.n_steps,
-            gamma=rl.gamma,
-            success_key=("next", "terminated"),
-        )
+        source_key = "demo_index" if config.grouped else None
+        self.replay = self.make_replay(keys[1:], source_key)
         self.shown = self.demonstrations(keys[1:], own_constants=not config.experts)
         self.starts: Tensor | None = None
         if self.shown is not None and config.experts:

@@ -11,8 +11,6 @@ from torch import Tensor
 from bgpo_trl.algorithms.algorithm import Algorithm
 from bgpo_trl.algorithms.rl import LearnerSpec
 from bgpo_trl.configs import DistNLLConfig, MAMLConfig
-from bgpo_trl.data.replay import GroupReplay
-from bgpo_trl.seeding import generators
 
 
 class TaskAlgorithm(Algorithm):
@@ -38,14 +36,7 @@ class TaskAlgorithm(Algorithm):
             device=self.device,
             experts=range(self.n_tasks),
         )
-        self.replay = GroupReplay(
-            config.rl.replay_size,
-            generator=generators(self.seeds, "replay"),
-            keys=self.replay_keys(),
-            n_steps=config.rl.n_steps,
-            gamma=config.rl.gamma,
-            success_key=("next", "terminated"),
-        )
+        self.replay = self.make_replay()
         self.shown = self.demonstrations()
         self._tasks = torch.arange(self.n_tasks).expand(self.n_seeds, -1)
         # As many transitions as guarantee a full batch of some task. Waiting for them makes

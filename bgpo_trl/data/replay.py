@@ -39,7 +39,7 @@ class GroupReplay:
             be stored.
         gamma: Discount of the rewards of these steps.
         success_key: Entry, bool ``[S, 1]``, that is true in the last transition of an episode that
-            succeeded; only ``successes`` of `draw` needs it. ``("next", "done")`` must be stored.
+            succeeded, stored too; only ``successes`` of `draw` needs it, and ``("next", "done")``.
 
     Raises:
         ValueError: If ``capacity`` or the number of generators is not positive.
@@ -193,7 +193,7 @@ class GroupReplay:
         drawn: dict[NestedKey, Tensor] = {}
         if self.n_steps > 1:
             rows, reward, n_taken = self._last_rows(steps, seeds)
-        hidden = {_GROUP} if self._source_key in self._keys else {_GROUP, self._source_key}
+        hidden = {_GROUP, self._source_key, self._success_key}.difference(self._keys)
         for key, stored in self._rows.items():
             if key not in hidden and (keys is None or key in keys):
                 at = rows if isinstance(key, tuple) and key[0] == "next" else first
@@ -395,7 +395,8 @@ class GroupReplay:
         stored_numbers = numbers if mask is None else compress(numbers, mask.tolist())
         if min(stored_numbers, default=0) < 0:
             raise ValueError(f"a group must be at least 0, got {numbers}")
-        keys = [*self._keys, *([] if self._source_key is None else [self._source_key])]
+        further = [key for key in (self._source_key, self._success_key) if key is not None]
+        keys = [*self._keys, *further]
         entries: dict[Any, Tensor] = {key: transition.get(key, None) for key in keys}
         if any(entry is None for entry in entries.values()):
             raise missing_key("GroupReplay", transition, keys)

@@ -16,7 +16,7 @@ from bgpo_trl.configs import STAGE_PRESETS, RepresentationConfig, RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import load_pretrained, weights_of_bank
 from bgpo_trl.encoders.probes import verdict_in
-from bgpo_trl.encoders.representation import Representation
+from bgpo_trl.encoders.representation import Representation, load_representation
 from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.experiments.arguments import Arguments, BankArguments
 from bgpo_trl.experiments.measure import draw, measure
@@ -221,13 +221,16 @@ def pretrained_for(
         ValueError: If a file is missing, damaged or of other encoders, no encoders come with the
             scene, or a task has no demonstrations.
     """
-    if weights is None and bank is not None:
-        weights = weights_of_bank(bank, scene)
-    encoders, found = load_pretrained(weights, tasks=tasks, scene=scene)
-    if bank is not None:
-        own = DemonstrationBank.load(bank, encoder_id=encoders.identity)
-        lacking = [task for task in tasks if task not in own.tasks]
-        found = own + found.for_tasks(lacking) if lacking else own
+    if bank is None:
+        encoders, found = load_pretrained(weights, tasks=tasks, scene=scene)
+        return encoders, found.for_tasks(tasks)
+    scene = find_scene(scene)
+    weights = weights or weights_of_bank(bank, scene)
+    encoders = load_representation(weights, scene=scene)
+    found = DemonstrationBank.load(bank, encoder_id=encoders.identity)
+    lacking = [task for task in tasks if task not in found.tasks]
+    if lacking:
+        found += load_pretrained(weights, scene=scene)[1].for_tasks(lacking)
     return encoders, found.for_tasks(tasks)
 
 

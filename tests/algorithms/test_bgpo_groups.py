@@ -145,7 +145,7 @@ def test_own_successes_of_the_group_are_a_share_of_what_is_imitated(make_bgpo, b
     n_own, n_lacking = 0, 0
     for step, batch in enumerate(batches, 60 - len(batches)):
         for seed in range(2):
-            won = episode[seed, :step][data["next", "terminated"][seed, :step, 0]]
+            won = episode[seed, :step][data["next", "success"][seed, :step, 0]]
             succeeded = torch.isin(episode[seed, :step], won)
             for place, group in enumerate(actives[step][seed].tolist()):
                 imitated = batch["imitation"][seed, place]
@@ -159,6 +159,19 @@ def test_own_successes_of_the_group_are_a_share_of_what_is_imitated(make_bgpo, b
                 assert own[:n].all() and demonstrated[n:].all()
                 n_own, n_lacking = n_own + n, n_lacking + (n == 0)
     assert n_own > 20 and n_lacking > 2
+
+
+def test_a_failure_that_ends_an_episode_is_no_success_to_imitate(make_bgpo):
+    """Such as a fall, which terminates the episode too."""
+    rl = replace(make_bgpo("all").config.rl, success_share=0.25)
+    algorithm = make_bgpo("all", rl=rl)
+    ended = play(make_bgpo("all"), 1)[0][:, 0]
+    for success in (False, True):
+        for key, value in (("done", True), ("terminated", True), ("success", success)):
+            ended["next", key] = torch.full((2, 1), value)
+        algorithm.store(ended)
+        drawn = algorithm.replay.draw(ended["group"].unsqueeze(1), successes=True)
+        assert (drawn["priority_weight"] == success).all()
 
 
 def test_what_is_stored_is_of_the_group_that_its_demonstration_has_today(make_bgpo, bank):

@@ -154,9 +154,9 @@ def test_successes_are_the_steps_of_episodes_that_ended_with_one(
         return GroupReplay(
             capacity,
             generator=generators(1),
-            keys=["latent", ("next", "done"), ("next", "terminated")],
+            keys=["latent", ("next", "done")],
             source_key="source",
-            success_key=("next", "terminated"),
+            success_key=("next", "success"),
         )
 
     replay, kept, episode = empty(), [], []
@@ -166,7 +166,7 @@ def test_successes_are_the_steps_of_episodes_that_ended_with_one(
             replay.load_state_dict(state)
         won, done = torch.tensor([[outcome == "succeeds"]]), torch.tensor([[outcome != "goes on"]])
         moment = {"latent": torch.tensor([[step]]), "source": torch.tensor([group])}
-        after = {"done": done, "terminated": won}
+        after = {"done": done, "success": won}
         replay.add(TensorDict({**moment, "next": after}, [1]), torch.tensor([group]))
         episode.append((group, step))
         if done:

@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,7 +13,6 @@ from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import load_representation, save_representation
 from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.experiments import make_data
-from bgpo_trl.experiments import run as experiment
 from bgpo_trl.experiments.arguments import EncodersArguments
 from bgpo_trl.experiments.run import pretrained_for
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
@@ -154,6 +154,12 @@ def shipped():
     return load_pretrained()
 
 
+def test_a_bank_of_all_tasks_needs_none_beside_the_encoders(tmp_path):
+    weights = shutil.copy(pretrained.default_weights(), tmp_path)
+    bank = pretrained.bank_path(pretrained.default_weights())
+    assert pretrained_for(TASKS, bank, weights=Path(weights))[1].tasks == TASKS
+
+
 @pytest.fixture(scope="module")
 def mixed(shipped):
     """Demonstrations of a shipped task and of another name."""
@@ -201,20 +207,23 @@ def test_inputs_of_another_run_or_scene_are_refused(shipped, mixed, tmp_path):
         load_inputs(tmp_path, TASKS, digests._replace(encoders="0123"))
 
 
-def test_tasks_that_the_bank_lacks_are_taken_from_the_package(
-    bank, encoders, monkeypatch, tmp_path
+def test_tasks_that_the_bank_lacks_are_taken_from_the_one_beside_the_encoders(
+    bank, encoders, tmp_path
 ):
-    """Of two tasks in the bank, one is shipped under the same name."""
+    """Of two tasks in the bank, one is beside the encoders under the same name."""
     one, two, three = TASKS
-    shipped = replace(bank, encoder_id=encoders.identity)
-    monkeypatch.setattr(experiment, "load_pretrained", lambda *_, **__: (encoders, shipped))
-    other = replace(shipped, embedding=bank.embedding + 1).for_tasks([one, two])
-    replace(other, tasks=("juggle", two)).save(tmp_path / "own.safetensors")
+    weights, own = tmp_path / "encoders.safetensors", tmp_path / "own.safetensors"
+    save_representation(encoders, weights)
+    beside = replace(bank, encoder_id=encoders.identity)
+    beside.save(pretrained.bank_path(weights))
+    other = replace(beside, embedding=bank.embedding + 1).for_tasks([one, two])
+    replace(other, tasks=("juggle", two)).save(own)
 
-    found = experiment.pretrained_for(["juggle", two, three], tmp_path / "own.safetensors")[1]
+    found = pretrained_for(["juggle", two, three], own, weights=weights)[1]
     assert found.tasks == ("juggle", two, three)
     for task, (name, offset) in enumerate([(one, 1), (two, 1), (three, 0)]):
         expected = bank.for_tasks([name])
         assert found.of_task(task).embedding.equal(expected.embedding + offset)
         assert found.of_task(task).train.equal(expected.train)
-    assert experiment.pretrained_for([two])[1].embedding.equal(bank.for_tasks([two]).embedding)
+    alone = pretrained_for([two], weights=weights)[1]
+    assert alone.embedding.equal(bank.for_tasks([two]).embedding)
