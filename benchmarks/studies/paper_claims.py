@@ -1,8 +1,9 @@
 """The claims of the paper are tested on the rows of its unfinished runs.
 
-Protocols 2 and 3 of docs/protocol.md: the rows count up to the largest number of episodes that all
+Protocols 2 to 4 of docs/protocol.md: the rows count up to the largest number of episodes that all
 runs have reached; a seed's score is the success of its tests in the last fifth of them, its area
-the mean over all its tests. Runs of one arm are in folders of one name, with the seed after it.
+the mean over all its evaluations of the success of the tasks presented by then. Runs of one arm are
+in folders of one name, with the seed after it.
 
     python benchmarks/studies/paper_claims.py benchmarks/results/paper-quarter
 """
@@ -15,6 +16,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 
 from bgpo_trl.analysis import statistics
@@ -80,7 +82,8 @@ def paper_claims(arguments: ClaimsArguments) -> str:
     for name, run in runs.items():
         late = run.tests[run.tests.episode > 0.8 * reached]
         success = run.success[:, run.episodes > 0.8 * reached]
-        scores[name], areas[name] = success.mean((1, 2)), run.success.mean((1, 2))
+        # Of each evaluation, the mean over the tasks presented so far.
+        scores[name], areas[name] = success.mean((1, 2)), np.nanmean(run.success, 2).mean(1)
         n_tests = len(late) // len(run.seeds)
         assert run.training is not None
         nodes = run.training.groupby("seed").num_nodes.last()

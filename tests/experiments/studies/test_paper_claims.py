@@ -73,6 +73,20 @@ def test_arms_of_one_algorithm_are_told_apart_by_their_folders(tmp_path):
         paper_claims.runs_of(tmp_path)
 
 
+def test_a_task_counts_in_the_area_from_when_it_is_presented(tmp_path, monkeypatch):
+    monkeypatch.setattr(paper_claims, "N_RANDOM", 1)
+    write(tmp_path, "slow", 0, 100, 0.5)
+    path = tmp_path / "slow-0" / "eval.csv.gz"
+    tests = pd.read_csv(path)
+    # Task 1 succeeds in eight of ten evaluations, before the others are presented.
+    tests = tests[(tests.task == TASKS[0]) | (tests.episode >= 90)]
+    tests["success"] = (tests.episode < 90).astype(int)
+    tests.to_csv(path, index=False)
+    text = paper_claims.paper_claims(ClaimsArguments(tmp_path))
+    row = next(row for row in cells(text.split("\n\n")[1]) if row[0] == "slow")
+    assert row[3] == "80.0"
+
+
 def test_runs_of_other_conditions_are_refused(tmp_path):
     write(tmp_path, "slow", 0, 20, 0.5)
     write(tmp_path, "fast", 0, 20, 0.5)
