@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
@@ -119,6 +119,7 @@ class RecordArguments(ImportArguments):
     The same command resumes an interrupted recording.
     """
 
+    same_command_continues: ClassVar[bool] = True
     path: tyro.conf.Positional[Path]
     """Folder of the dataset."""
     scene: str = "nico"
@@ -147,6 +148,7 @@ class EncodersArguments(ImportArguments):
     The same command resumes an interrupted training.
     """
 
+    same_command_continues: ClassVar[bool] = True
     dataset: tyro.conf.Positional[Path]
     """Folder of the recorded demonstrations."""
     play: tyro.conf.Positional[Path | None] = None
@@ -219,6 +221,7 @@ class SweepArguments(BankArguments):
     cluster, all machines need Ray and bgpo_trl, and must see --out at the same path.
     """
 
+    same_command_continues: ClassVar[bool] = True
     algorithms: tuple[str, ...] = ("bgpo",)
     """Algorithms, as in `bgpo concurrent`."""
     settings: tuple[Setting, ...] = ("concurrent",)

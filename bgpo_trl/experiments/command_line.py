@@ -60,7 +60,8 @@ def command_line(
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         if not resumable:
-            sys.exit("interrupted")
+            again = getattr(asked, "same_command_continues", False)
+            sys.exit("interrupted" + ": the same command continues" * again)
         sys.stderr.write("interrupted: the same command with --resume continues\n")
         sys.exit(os.EX_TEMPFAIL)
     if text is not None:

@@ -94,8 +94,9 @@ def check_robot(arguments: DoctorArguments) -> str:
         )
     if rate < _SLOW:
         seen += (
-            "; this is slow: without a GPU, shadows and antialiasing cost most, of an own scene "
-            "switch them off (docs/extending.md, Your robot)"
+            "; this is slow, unless other programs used the cores: without a GPU, shadows and "
+            "antialiasing cost most, switch them off in an own scene (docs/extending.md, Your "
+            "robot)"
         )
     if doubts := check_scene(scene):
         raise UserWarning("; ".join([seen, *doubts]))

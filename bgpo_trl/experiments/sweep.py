@@ -244,11 +244,8 @@ def sweep(arguments: SweepArguments) -> str:
         if arguments.address == "local":  # The machines of a cluster are not this one.
             opengl.check()
         cpus, gpus = arguments.cpus_per_run, arguments.gpus_per_run
-        try:
-            with connected(arguments.address, cpus, gpus):
-                failed = play_jobs(todo, play, cpus=cpus, gpus=gpus)
-        except KeyboardInterrupt:
-            sys.exit("interrupted: the same command continues")
+        with connected(arguments.address, cpus, gpus):
+            failed = play_jobs(todo, play, cpus=cpus, gpus=gpus)
     if failed:
         raise RuntimeError("; ".join(f"{job} failed: {why}" for job, why in failed.items()))
     return f"jobs: {len(jobs)}, run: {len(todo)}; bgpo report {arguments.out}"

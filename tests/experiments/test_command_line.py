@@ -13,7 +13,7 @@ import torch
 
 from bgpo_trl import __main__ as bgpo
 from bgpo_trl.configs import BGPOConfig
-from bgpo_trl.experiments.arguments import Arguments
+from bgpo_trl.experiments.arguments import Arguments, ProbesArguments, RecordArguments
 from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.machine import interrupts_wait
 from suites import opengl
@@ -153,6 +153,22 @@ def test_an_interrupted_run_exits_with_the_status_for_another_try(capsys, number
     assert "--resume" in capsys.readouterr().err
     assert saved == [1] * training
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_other_commands_that_are_interrupted_say_whether_they_continue():
+    def record(arguments: RecordArguments):
+        raise KeyboardInterrupt
+
+    def probes(arguments: ProbesArguments):
+        raise KeyboardInterrupt
+
+    for command, message in (
+        (record, "interrupted: the same command continues"),
+        (probes, "interrupted"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            command_line(command, ["data"])
+        assert ended.value.code == message
 
 
 def test_an_error_of_own_code_keeps_its_traceback_unless_it_misuses_the_package():

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.scenes import Outcome, RobotEnv, find_scene
+from bgpo_trl.scenes import Outcome, RobotEnv, StateColumns, find_scene
 from bgpo_trl.scenes.check import check_scene
-from tests.scenes.dot import Dot, scene
+from bgpo_trl.seeding import random_state
+from tests.scenes.dot import Dot, SavedDot, scene
 
 
 class Late(Dot):
@@ -69,6 +70,40 @@ class Solved(Dot):
         return Outcome(True)
 
 
+class SolvedByTheSecondStep(SavedDot):
+    steps = 0
+
+    def reset(self, task):
+        super().reset(task)
+        self.steps = 0
+
+    def step(self, action):
+        self.steps += 1
+        return Outcome(super().step(action).success or self.steps == 2)
+
+
+class Misplaced(SavedDot):
+    """Does not load the place."""
+
+    def load(self, state):
+        super().load(state | {"place": self.place})
+
+
+class Redrawn(SavedDot):
+    """Does not load what starts are drawn from."""
+
+    def load(self, state):
+        super().load(state | {"random": random_state(self.random)})
+
+
+class Alias(SavedDot):
+    """Saves an array that it goes on changing."""
+
+    def reset(self, task):
+        super().reset(task)
+        self.place = np.array(self.place)
+
+
 ALWAYS = "begin with the same frame "
 
 
@@ -81,6 +116,14 @@ ALWAYS = "begin with the same frame "
         (AlwaysHere, [ALWAYS + "with whatever seed", ALWAYS + "reset after reset"]),
         (SeededAnew, [ALWAYS + "with whatever seed", ALWAYS + "reset after reset"]),
         (Deaf, ["component 0 (from 0) of actions changes no frame"]),
+        (SavedDot, []),
+        (Misplaced, ["differently after load()"]),
+        (Redrawn, ["differently after load()"]),
+        (Alias, ["differently after load()"]),
+        (
+            SolvedByTheSecondStep,
+            [f"'{task}' succeeds by actions of 0 alone" for task in ("left", "right")],
+        ),
     ],
 )
 def test_doubts(make, doubts, tmp_path):
@@ -107,6 +150,17 @@ def test_what_is_wrong_is_not_recorded(make, reason, tmp_path):
     with pytest.raises(ValueError, match=reason):
         record_demonstrations(tmp_path, scene=scene(make), progress=False)
     assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("method", ["state", "joints"])
+def test_numbers_of_another_size_than_the_scene_says_are_refused(method):
+    class Short(Dot):
+        pass
+
+    setattr(Short, method, lambda self: [self.place])
+    columns = {method: StateColumns(center=[0, 0], scale=[1, 1])}
+    with pytest.raises(ValueError, match=rf"Short.{method}\(\) returned .*: return 2 finite"):
+        check_scene(scene(Short, **columns))
 
 
 def test_a_physical_robot_is_not_moved_and_its_connection_is_closed():
