@@ -379,6 +379,8 @@ def _doubts(scene: Scene, episode: Mapping[str, Any], known: set[bytes]) -> Iter
     repeated = (pixels[1:] == pixels[:-1]).all((1, 2, 3))
     if repeated.all():
         yield "show one frame throughout: did the camera stand still?"
+    elif pixels.max() <= 1:
+        yield "have no color above 1: are they fractions, which uint8 cuts off?"
     content = hashlib.sha256(pixels.data).digest()
     if content in known:
         yield "have the frames of an earlier one: give each once"

@@ -131,6 +131,13 @@ def test_episodes_without_movement_and_such_as_are_given_twice_are_named(tmp_pat
     ]
 
 
+def test_frames_of_fractions_that_were_cut_off_are_named(tmp_path):
+    frames = episode_of(4, keys=("pixels",))["pixels"]
+    episode = {"pixels": (frames / frames.max()).astype(np.uint8)}
+    with pytest.warns(UserWarning, match="1 of 1 episodes, .* have no color above 1"):
+        write(tmp_path / "own", {TASKS[0]: [episode]}, held_out_per_task=0)
+
+
 @pytest.mark.parametrize(
     ("length", "order", "doubt"),
     [
