@@ -164,13 +164,16 @@ def plot_first_gwr(algorithm: Algorithm, seen: DemonstrationBank) -> Figure:
 
 
 def success_lines(run: Run) -> list[str]:
-    """Return a line for each task about the final tests, and what to do if one seldom succeeds."""
-    success, steps = (final_means(run, "seen", column) for column in ("success", "steps"))
+    """Return a line for each task about the final tests, and what to do if one seldom succeeds.
+
+    Of the tests, those with held-out demonstrations.
+    """
+    success, steps = (final_means(run, "held-out", column) for column in ("success", "steps"))
     if success is None:
         return []
     shown, lines = run.summary["demonstrated_steps"], list[str]()
     for index, task in enumerate(run.tasks):
-        line = f"{task}: {success[:, index].mean():.0%} of tests succeed"
+        line = f"{task}: {success[:, index].mean():.0%} of held-out tests succeed"
         if steps is not None and not np.isnan(steps[:, index]).all():
             line += f", in {np.nanmean(steps[:, index]):.1f} steps"
             line += f" (demonstrated in {shown[task]:.1f})" if task in shown else ""

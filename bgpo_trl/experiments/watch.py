@@ -163,7 +163,7 @@ def watch(arguments: WatchArguments) -> str:
         strips[f"{episode.task}: the robot's view, {episode.outcome}"] = episode.seen
     save_figure(plot_frame_strips(strips), out / "film.png")
     outcomes = [f"{episode.task}: {episode.outcome}" for episode in episodes]
-    learned = f"seed {policy.seed} after {policy.episodes:,} training episodes"
+    learned = f"seed {policy.seed} after {policy.episodes:,} of {config.episodes:,} episodes"
     return "\n".join([learned, *outcomes, f"pictures: {out}"])
 
 

@@ -45,9 +45,9 @@ def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path):
     run = tmp_path / "a run"
     printed = concurrent(Arguments(out=run))
     for task, of_task in (
-        read_table(run / "final.csv").query("demonstrations == 'seen'").groupby("task")
+        read_table(run / "final.csv").query("demonstrations == 'held-out'").groupby("task")
     ):
-        assert f"{task}: {of_task['success'].mean():.0%} of tests succeed" in printed
+        assert f"{task}: {of_task['success'].mean():.0%} of held-out tests succeed" in printed
     assert "docs/extending.md says where to look" in printed  # after six episodes
     assert "GWR-B nodes: [" in printed and "groups of behaviors: [" in printed
     assert shlex.split(printed)[-3:] == ["bgpo", "report", str(run)]
@@ -329,7 +329,7 @@ def test_a_run_says_what_it_reached_and_in_how_many_steps():
     """Of an archived run: equal to its rows, whose tests are as many for each seed."""
     run = read_run(RESULTS / "desk-learner" / "continual-bgpo")
     *lines, last = success_lines(run)
-    tests = run.final[run.final["demonstrations"] == "seen"]
+    tests = run.final[run.final["demonstrations"] == "held-out"]
     for line, task in zip([*lines, last], run.tasks, strict=True):
         rate, steps, shown = map(float, re.findall(r"([\d.]+)(?:%| steps|\))", line))
         found = tests[tests["task"] == task].groupby("seed")[["success", "steps"]].mean().mean()

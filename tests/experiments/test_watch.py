@@ -33,7 +33,7 @@ def test_a_film_has_its_files_and_leaves_the_run_unchanged(run_of, undemonstrate
     expected = {"film.gif", "film.png"}
     assert {path.name for path in out.iterdir()} == expected
     first, *outcomes, last = printed.splitlines()
-    assert re.fullmatch(r"seed 8 after \d+ training episodes", first)
+    assert re.fullmatch(r"seed 8 after \d+ of \d+ episodes", first)
     assert [line.split(": ")[0] for line in outcomes] == [*nico.PAPER_TASKS]
     assert last == f"pictures: {out}"
 
