@@ -123,20 +123,6 @@ def test_a_time_out_is_terminal_unless_it_bootstraps_and_pays_the_bonus_in_both(
     assert stored.equal(end["terminated"][1])
 
 
-@pytest.mark.parametrize("variant", ["latent, label", "latent, nothing", "all"])
-def test_only_a_variant_with_a_label_acts_by_it(make_bgpo, bank, variant):
-    algorithm = make_bgpo(variant, schedule=TaskSchedule((0, 0, 0)))
-    embedding = bank.held_out().embedding.view(3, 4, 32)
-    state = torch.randn(2, 3, 4, 64, generator=torch.Generator().manual_seed(0))
-    first, second = (
-        act_in_tests(algorithm, state, embedding, torch.full((3, 4), task)) for task in (0, 1)
-    )
-    assert first.shape == (2, 3, 4, 4)
-    assert first.equal(second) == (variant != "latent, label")
-    other = act_in_tests(algorithm, state, 5 - embedding.flip(0), torch.zeros(3, 4).long())
-    assert first.equal(other) == (variant != "all")
-
-
 def act_by_hand(weights, x):
     """The action of a policy of test episodes, from its weights."""
     if "only_clone" not in weights:
@@ -194,7 +180,7 @@ def test_targets_are_clipped_to_the_attainable_returns(make_bgpo, variant, chang
     assert bounds == pytest.approx((0.0, highest))
 
 
-def test_what_an_algorithm_lacks_is_refused(make_config, bank, encoders, in_world):
+def test_what_an_algorithm_lacks_is_refused(make_config, bank, in_world):
     for state in ("latent", "state"):
         config = make_config(state, "without-gwr").algorithm
         with pytest.raises(ValueError, match="needs trained encoders"):
@@ -202,13 +188,8 @@ def test_what_an_algorithm_lacks_is_refused(make_config, bank, encoders, in_worl
     config = replace(make_config("state", "oracle").algorithm, demonstration_share=0.25)
     with pytest.raises(ValueError, match="demonstrations are latents"):
         BGPO(config, seeds=(0,), bank=bank.seen())
-    config, without = make_config().algorithm, replace(bank.seen(), steps=None)
-    with pytest.raises(ValueError, match=r"^the bank has no steps of demonstrations[^\n]*$"):
-        BGPO(config, seeds=(0,), bank=without, encoders=encoders)
-    with pytest.raises(
-        ValueError, match=r"^demonstration_share must be above 0 for a policy[^\n]*$"
-    ):
-        replace(config, demonstration_share=0.0)
+    with pytest.raises(ValueError, match="demonstration_share must be above 0 for a policy"):
+        replace(make_config().algorithm, demonstration_share=0.0)
 
 
 def test_the_clone_never_reads_a_reward(make_bgpo):

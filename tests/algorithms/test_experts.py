@@ -79,14 +79,6 @@ def learn(experts, seed, rows=slice(None)):
     experts.learner.learn(batch)
 
 
-def width_of(experts):
-    return experts.learner.loss.batch_size[1]
-
-
-def slot_of(experts, seed, group):
-    return experts.active.groups[seed].index(group)
-
-
 def tensors_of(experts, seed, slot):
     """Copies of all that makes up one expert: networks, targets, moments of Adam."""
     loss, optimizer = experts.learner.loss, experts.learner.optimizer
@@ -207,7 +199,7 @@ def test_a_stack_is_as_wide_as_groups_are_active():
     for step, groups in enumerate([(0, 0), (0, 1), (2, 1), (3, 1), (4, 1), *[(4, 1)] * 3]):
         experts.play(groups)
         learn(experts, step)
-        widths.append(width_of(experts))
+        widths.append(experts.learner.loss.batch_size[1])
         assert {p.shape[:2] for p in experts.learner.loss.parameters()} == {(2, widths[-1])}
         for state in experts.learner.optimizer.state.values():
             assert state["exp_avg"].shape[:2] == (2, widths[-1])
@@ -221,7 +213,7 @@ def test_a_group_that_ends_is_put_aside_and_comes_back_as_it_was(name):
     for step, group in enumerate([0, 1, 2, 1]):
         experts.play([group, 0])
         learn(experts, step)
-    kept = {group: tensors_of(experts, 0, slot_of(experts, 0, group)) for group in (0, 1, 2)}
+    kept = {group: tensors_of(experts, 0, slot) for slot, group in enumerate((0, 1, 2))}
     experts.rest(0, 1)
     assert experts.active.groups[0] == [0, 2]
     assert not differing(tensors_of(experts, 0, 1), kept[2])
@@ -229,7 +221,8 @@ def test_a_group_that_ends_is_put_aside_and_comes_back_as_it_was(name):
         assert_policy(experts, 0, group, like)
     experts.play([1, 0])
     for group, tensors in kept.items():
-        assert not differing(tensors_of(experts, 0, slot_of(experts, 0, group)), tensors)
+        slot = experts.active.groups[0].index(group)
+        assert not differing(tensors_of(experts, 0, slot), tensors)
 
 
 @every_kind

@@ -67,15 +67,6 @@ def test_the_rules_by_hand():
     assert trials.clone_is_better(0, 7)
     assert play(trials, [True]) == [False] and not trials.clone_is_better(0, 7)  # 20, and as good
     assert play(trials, [True] * 11) == [False, True] + [False, False, False, True] * 2 + [False]
-    while trials.begin(0, 7):
-        trials.end(0, True, group=7)
-    trials.end(0, False, group=7)
-    assert trials.clone_is_better(0, 7)
-    while not trials.begin(0, 7):
-        trials.end(0, True, group=7)
-    # The clone's latest failure weighs more than the choice's older one.
-    trials.end(0, False, group=7)
-    assert not trials.clone_is_better(0, 7)
 
 
 def test_a_group_that_is_no_more_is_forgotten():
