@@ -237,15 +237,6 @@ def test_a_part_of_a_joined_group_parts_unless_the_groups_expert_solves_it(
         assert len(each.numbers) == n_groups + 1
 
 
-def test_eight_of_fifty_demonstrations_are_a_group_and_eight_of_thirty_are_not():
-    groups, few = BehaviorGroups(4), around(1, 8)
-    show(groups, torch.cat([around(0, 22), few]))
-    assert groups.numbers == [0]
-    show(groups, around(0, 20, seed=1))
-    assert groups.numbers == [0, 1]
-    assert group_of(groups, few) == [1]
-
-
 # ---- the shipped banks
 
 
