@@ -132,44 +132,27 @@ def look_up(groups, phi):
     return torch.stack([m.group for m in matches]), torch.stack([m.novelty for m in matches])
 
 
-@pytest.mark.parametrize("seeds", [None, [4, 2, 3]])
-@pytest.mark.parametrize("learn", [True, False])
-def test_the_group_is_set_at_reset_and_constant_in_the_episode(seeds, learn):
-    env, groups = make_groups(seeds, learn=False)
+@pytest.mark.parametrize(("seeds", "lengths"), [(None, 3), ([4, 2, 3], [2, 3, 5])])
+def test_a_group_is_that_of_the_demonstration_and_groups_learn_when_episodes_end(seeds, lengths):
+    """Rows whose episodes end at different times, against groups adapted by hand."""
+    env, groups = make_groups(seeds, lengths, learn=False)
     check_env_specs(env)
-    env.transform[-1].learn = learn
-    adapt(groups, 15)
-    assert all(of_row.revision == 0 for of_row in groups)
-    start = env.reset()
-    assert start["group"].equal(torch.zeros(env.batch_size, dtype=torch.int64))
-    assert start["group_novelty"].isfinite().all()
-    for _ in range(6):
-        group, novelty = look_up(groups, start["demo_embedding"].view(len(groups), 32))
-        assert start["group"].flatten().equal(group)
-        assert start["group_novelty"].flatten().equal(novelty)
-        steps, following = play(env, 3, start.clone())  # one episode
-        for key in ("group", "group_novelty"):
-            for data in (steps, steps["next"]):
-                assert (data[key] == start[key].unsqueeze(-1)).all()
-        start = following
-    assert all((len(of_row.numbers) > 1) == learn for of_row in groups)
-
-
-def test_groups_learn_from_episodes_that_end_only():
-    """Seeds whose episodes end at different times, against groups adapted by hand."""
-    env, groups = make_groups([4, 2, 3], lengths=[2, 3, 5])
+    env.transform[-1].learn = True
     adapt(groups, 15)
     plain = deepcopy(groups)
     state = env.reset()
+    assert not state["group"].any() and state["group_novelty"].isfinite().all()
     for _ in range(30):
         steps, following = play(env, 1, state.clone())
-        ended = steps["next", "done"].flatten()
-        for row in ended.nonzero().flatten().tolist():
-            plain[row].adapt(state["demo_embedding"][row])
-        group, _ = look_up(plain, following["demo_embedding"])
-        assert following["group"][ended].equal(group[ended])
-        assert following["group"][~ended].equal(state["group"][~ended])
-        assert following["group_novelty"][~ended].equal(state["group_novelty"][~ended])
+        ended = steps["next", "done"].view(env.batch_size)
+        phi = state["demo_embedding"].view(len(groups), 32)
+        for row in ended.flatten().nonzero().flatten().tolist():
+            plain[row].adapt(phi[row])
+        found = look_up(plain, following["demo_embedding"].view(len(groups), 32))
+        for key, expected in zip(("group", "group_novelty"), found, strict=True):
+            assert steps["next", key][..., -1].equal(state[key])  # constant in the episode
+            expected = torch.where(ended, expected.view(env.batch_size), state[key])
+            assert following[key].equal(expected)
         state = following
     for ours, theirs in zip(groups, plain, strict=True):
         assert str(ours.state_dict()) == str(theirs.state_dict())
