@@ -36,12 +36,7 @@ def make_batch(*shape, seed=0):
         return torch.randn(*shape, size, generator=generator)
 
     ended = torch.rand(*shape, 1, generator=generator) < 0.2
-    following = {
-        "state": draw(6),
-        "terminated": ended,
-        "done": ended,
-        "reward": ended.float(),
-    }
+    following = {"state": draw(6), "terminated": ended, "done": ended, "reward": ended.float()}
     data, shown = (
         {"state": draw(6), "label": draw(2), "action": draw(4).clamp(-1, 1)} for _ in range(2)
     )

@@ -69,16 +69,6 @@ def test_the_rules_by_hand():
     assert play(trials, [True] * 11) == [False, True] + [False, False, False, True] * 2 + [False]
 
 
-def test_a_group_that_is_no_more_is_forgotten():
-    trials = ProposalTrials(1, clone_episodes=2, clone_share=0.0)
-    for group in (7, 4):
-        play(trials, [True, False, True], group)
-    kept = copy.deepcopy(trials.state_dict()["groups"][0][7])
-    trials.follow(0, [7, 9], [7])
-    assert trials.state_dict()["groups"][0] == {7: kept}
-    assert play(trials, [True], group=4) == [True]  # a number that returns begins anew
-
-
 def test_episodes_of_demonstrations_that_belong_to_another_group_do_not_count():
     """A new task's first episodes are played by an old group, and fail; then it has its own."""
     trials = ProposalTrials(1, clone_episodes=0, clone_share=0.5)
