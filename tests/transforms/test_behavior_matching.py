@@ -2,13 +2,7 @@
 
 import pytest
 import torch
-from torchrl.envs import (
-    Compose,
-    RenameTransform,
-    RewardSum,
-    TransformedEnv,
-    check_env_specs,
-)
+from torchrl.envs import Compose, RenameTransform, RewardSum, TransformedEnv, check_env_specs
 
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.transforms import BehaviorMatchingReward, FrameEncoder

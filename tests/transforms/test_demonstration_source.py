@@ -10,15 +10,18 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, RewardSum, SerialEnv, StepCounter, TransformedEnv, check_env_specs
 
 from bgpo_trl.transforms import DemonstrationSource, TaskSchedule
-from tests.transforms.environment import MockEnv, generators, make_bank, play
+from tests.transforms.environment import (
+    CONCURRENT,
+    MockEnv,
+    generators,
+    make_bank,
+    make_source,
+    play,
+)
 
-CONCURRENT = TaskSchedule((0, 0, 0))
 
-
-def make(seeds=None, lengths=3, schedule=CONCURRENT, base=None, **kwargs):
-    batch_size = [] if seeds is None else [len(seeds)]
-    kwargs.setdefault("generator", generators(seeds or [0]))
-    source = DemonstrationSource(make_bank(), schedule, batch_size=batch_size, **kwargs)
+def make(seeds=None, lengths=3, schedule=CONCURRENT, base=None):
+    source = make_source(seeds, schedule)
     base = base or MockEnv(seeds, lengths)
     return TransformedEnv(base, Compose(StepCounter(50), source)), source
 
