@@ -1,5 +1,6 @@
 """Datasets of demonstrations: damaged ones, and those that are written from elsewhere."""
 
+import os
 import shutil
 import warnings
 from collections.abc import Sequence
@@ -25,6 +26,8 @@ KEYS = {"pixels", "state", "action", "length", "task", "train", "seed"}
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
+        (lambda p: os.truncate(p / "pixels.memmap", 1000), r"memmap is missing or truncated"),
+        (lambda p: (p / "dataset.json").write_text("{"), r"dataset\.json is damaged"),
         (lambda p: (p / "dataset.json").unlink(), "not a dataset of demonstrations"),
         (lambda p: edit(p / "dataset.json", checksum=None), "not complete; resume it"),
         (lambda p: edit(p / "dataset.json", scene_version="old"), "recorded in scene 'old'"),
