@@ -12,7 +12,7 @@ from tests.algorithms.playing import assert_same, perceptron, play, spy_batches,
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 SEEDS = (4, 6)
-SIZE, N_TASKS = 16, 3  # of the ground truth, and tasks
+N_TASKS = 3
 both = pytest.mark.parametrize("name", ["maml", "dist-nll"])
 
 

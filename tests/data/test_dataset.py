@@ -20,8 +20,6 @@ from bgpo_trl.data.dataset import (
 )
 from tests.helpers import contents, edit
 
-KEYS = {"pixels", "state", "action", "length", "task", "train", "seed"}
-
 
 @pytest.mark.parametrize(
     ("damage", "message"),
