@@ -28,7 +28,7 @@ CHANGES = dict.fromkeys(("group-balanced replay", "experts", "clone", "all"), GR
 SCHEDULE = TaskSchedule((0, 2, 4))
 
 
-def make_batch(*shape, n_state=6, seed=0):
+def make_batch(*shape, seed=0):
     """Transitions of noise, of which a fifth succeed, and actions of noise to imitate."""
     generator = torch.Generator().manual_seed(seed)
 
@@ -36,14 +36,9 @@ def make_batch(*shape, n_state=6, seed=0):
         return torch.randn(*shape, size, generator=generator)
 
     ended = torch.rand(*shape, 1, generator=generator) < 0.2
-    following = {
-        "state": draw(n_state),
-        "terminated": ended,
-        "done": ended,
-        "reward": ended.float(),
-    }
+    following = {"state": draw(6), "terminated": ended, "done": ended, "reward": ended.float()}
     data, shown = (
-        {"state": draw(n_state), "label": draw(2), "action": draw(4).clamp(-1, 1)} for _ in range(2)
+        {"state": draw(6), "label": draw(2), "action": draw(4).clamp(-1, 1)} for _ in range(2)
     )
     return TensorDict({**data, "imitation": shown, "next": following}, shape)
 

@@ -21,21 +21,6 @@ def test_with_one_group_it_is_the_plain_learner_bit_for_bit(make_bgpo):
     assert_same(plain.learner.state_dict(), one.learner.state_dict())
 
 
-@pytest.mark.parametrize(("asked", "noise"), [(None, 0.4), (0.3, 0.3), (0.0, 0.0)])
-def test_imitated_states_get_the_noise_of_the_bank_or_the_one_asked_for(
-    make_bgpo, bank, asked, noise
-):
-    """Told by how far they are from each frame of the bank."""
-    noisy = replace(bank, noise=0.4)
-    algorithm = make_bgpo("all", bank=noisy, demonstration_noise=asked)
-    play(algorithm, 30)
-    group = algorithm.active.group[:, :1, None].expand(-1, -1, 500)
-    drawn = algorithm.shown.draw_actions(group)["latent"]
-    frames = bank.steps.latents(torch.arange(len(bank.steps.latent)))
-    apart = torch.cdist(drawn.flatten(0, 2), frames).amin(1) / 64**0.5
-    assert float(apart.mean()) == pytest.approx(noise, abs=0.02)
-
-
 def test_joined_groups_have_one_expert_and_one_replay(make_bgpo, bank):
     algorithm = make_bgpo("all", schedule=TaskSchedule((0, 0, 0)), known=15)
     _, state = play(algorithm, 60)
@@ -172,41 +157,6 @@ def test_a_failure_that_ends_an_episode_is_no_success_to_imitate(make_bgpo):
         algorithm.store(ended)
         drawn = algorithm.replay.draw(ended["group"].unsqueeze(1), successes=True)
         assert (drawn["priority_weight"] == success).all()
-
-
-def test_what_is_stored_is_of_the_group_that_its_demonstration_has_today(make_bgpo, bank):
-    """Groups split while they are played."""
-    algorithm = make_bgpo("all", schedule=TaskSchedule((0, 0, 0)), known=9)
-    n_groups, played, state = set(), [set(), set()], None
-    for _ in range(30):
-        data, state = play(algorithm, 4, state)
-        for seed, groups in enumerate(algorithm.groups):
-            n_groups.add(len(groups.numbers))
-            group_of = groups.lookup(bank.seen().embedding).group
-            played[seed] |= {*data["group"][seed].tolist()}
-            known = {*groups.numbers, -1}
-            assert {*algorithm.active.group[seed].tolist()} <= known
-            for replay in (algorithm.replay, algorithm.shown._shown):
-                if len(replay):
-                    entries, group = replay.contents(seed)
-                    assert group.equal(group_of[entries["demo_index"]])
-                    counts = replay.sizes(torch.arange(9).expand(2, 9))[seed]
-                    assert counts.equal(group.bincount(minlength=9))
-    assert n_groups >= {1, 3}
-    assert all(groups.revision > 0 for groups in algorithm.groups)
-    assert all(len(groups) > 2 for groups in played)
-
-
-def test_a_shown_demonstration_ends_with_the_reward_for_matching_it(make_bgpo, bank):
-    """By hand: a success, and the bonus of its own embedding for the behavior of its episode."""
-    algorithm = make_bgpo("all", schedule=TaskSchedule((0, 0, 0)))
-    data, _ = play(algorithm, 40)
-    for seed in range(2):
-        ends = data[seed][data["next", "done"][seed].flatten()]
-        shown, _ = algorithm.shown._shown.contents(seed)
-        assert shown["demo_index"].equal(ends["demo_index"])
-        error = (ends["behavior"] - bank.seen().embedding[ends["demo_index"]]).norm(dim=-1)
-        torch.testing.assert_close(shown["reward"], 1 + 0.1 * torch.exp(-error))
 
 
 def test_nothing_is_known_of_tasks_that_have_not_been_presented(make_bgpo, bank):

@@ -12,7 +12,6 @@ from bgpo_trl.algorithms.experts import ActiveGroups, Experts
 from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
 from bgpo_trl.configs import SHOWN, RLConfig
 from tests.algorithms.playing import make_batch
-from tests.helpers import through_a_file
 
 KINDS = {"actor": RLConfig(), "both": SHOWN}  # by their proposals
 every_kind = pytest.mark.parametrize("name", KINDS)
@@ -79,14 +78,6 @@ def learn(experts, seed, rows=slice(None)):
     experts.learner.learn(batch)
 
 
-def width_of(experts):
-    return experts.learner.loss.batch_size[1]
-
-
-def slot_of(experts, seed, group):
-    return experts.active.groups[seed].index(group)
-
-
 def tensors_of(experts, seed, slot):
     """Copies of all that makes up one expert: networks, targets, moments of Adam."""
     loss, optimizer = experts.learner.loss, experts.learner.optimizer
@@ -131,12 +122,17 @@ def assert_policy(experts, seed, group, tensors):
 
 @every_kind
 def test_what_is_put_aside_comes_back_as_it_was(name):
-    """Six groups in two slots: whatever else was played and learned, bit for bit."""
+    """Six groups in two slots, of which some end: whatever else was learned, bit for bit."""
     experts, left = make(name), [{}, {}]
     generator = torch.Generator().manual_seed(1)
     returned = 0
     for step in range(30):
         groups = torch.randint(6, (2,), generator=generator).tolist() if step else [0, 0]
+        if step % 7 == 6:
+            ended = experts.active.groups[0][0]
+            experts.rest(0, ended)
+            assert ended not in experts.active.groups[0]
+            assert_policy(experts, 0, ended, left[0][ended])
         slots = experts.play(groups).tolist()
         for seed, (group, slot) in enumerate(zip(groups, slots, strict=True)):
             assert experts.active.group[seed, slot] == group
@@ -207,52 +203,9 @@ def test_a_stack_is_as_wide_as_groups_are_active():
     for step, groups in enumerate([(0, 0), (0, 1), (2, 1), (3, 1), (4, 1), *[(4, 1)] * 3]):
         experts.play(groups)
         learn(experts, step)
-        widths.append(width_of(experts))
+        widths.append(experts.learner.loss.batch_size[1])
         assert {p.shape[:2] for p in experts.learner.loss.parameters()} == {(2, widths[-1])}
         for state in experts.learner.optimizer.state.values():
             assert state["exp_avg"].shape[:2] == (2, widths[-1])
             assert int(state["step"]) == step + 1
     assert widths == [1, 2, 2, 3, 3, 3, 2, 1]
-
-
-@every_kind
-def test_a_group_that_ends_is_put_aside_and_comes_back_as_it_was(name):
-    experts = make(name, most=3)
-    for step, group in enumerate([0, 1, 2, 1]):
-        experts.play([group, 0])
-        learn(experts, step)
-    kept = {group: tensors_of(experts, 0, slot_of(experts, 0, group)) for group in (0, 1, 2)}
-    experts.rest(0, 1)
-    assert experts.active.groups[0] == [0, 2]
-    assert not differing(tensors_of(experts, 0, 1), kept[2])
-    for group, like in {**kept, 3: kept[1]}.items():  # 3 parted from 1
-        assert_policy(experts, 0, group, like)
-    experts.play([1, 0])
-    for group, tensors in kept.items():
-        assert not differing(tensors_of(experts, 0, slot_of(experts, 0, group)), tensors)
-
-
-@every_kind
-def test_restored_experts_go_on_bit_for_bit(name):
-    def play(experts, steps):
-        for step in steps:
-            experts.play([step % 5, step % 3])
-            learn(experts, step)
-
-    experts, restored = make(name), make(name, seeds=(0, 1))
-    play(experts, range(13))
-    play(restored, range(4))
-    parts = {"learner": experts.learner.state_dict(), "experts": experts.state_dict()}
-    state = through_a_file(parts)
-    restored.load_state_dict(state["experts"])
-    restored.learner.load_state_dict(state["learner"])
-    for one in (experts, restored):
-        play(one, range(13, 25))
-    assert restored.active.group.equal(experts.active.group)
-    for seed in range(2):
-        for slot in range(len(experts.active.groups[seed])):
-            ours, theirs = (tensors_of(one, seed, slot) for one in (experts, restored))
-            assert not differing(ours, theirs)
-        for group in range(6):
-            ours, theirs = (policy_of(one, seed, group) for one in (experts, restored))
-            assert not differing(ours, theirs)

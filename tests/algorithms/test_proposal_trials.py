@@ -67,25 +67,6 @@ def test_the_rules_by_hand():
     assert trials.clone_is_better(0, 7)
     assert play(trials, [True]) == [False] and not trials.clone_is_better(0, 7)  # 20, and as good
     assert play(trials, [True] * 11) == [False, True] + [False, False, False, True] * 2 + [False]
-    while trials.begin(0, 7):
-        trials.end(0, True, group=7)
-    trials.end(0, False, group=7)
-    assert trials.clone_is_better(0, 7)
-    while not trials.begin(0, 7):
-        trials.end(0, True, group=7)
-    # The clone's latest failure weighs more than the choice's older one.
-    trials.end(0, False, group=7)
-    assert not trials.clone_is_better(0, 7)
-
-
-def test_a_group_that_is_no_more_is_forgotten():
-    trials = ProposalTrials(1, clone_episodes=2, clone_share=0.0)
-    for group in (7, 4):
-        play(trials, [True, False, True], group)
-    kept = copy.deepcopy(trials.state_dict()["groups"][0][7])
-    trials.follow(0, [7, 9], [7])
-    assert trials.state_dict()["groups"][0] == {7: kept}
-    assert play(trials, [True], group=4) == [True]  # a number that returns begins anew
 
 
 def test_episodes_of_demonstrations_that_belong_to_another_group_do_not_count():

@@ -8,17 +8,11 @@ import torch
 
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import TaskSchedule
-from tests.algorithms.playing import (
-    assert_same,
-    perceptron,
-    play,
-    spy_batches,
-    weights_of,
-)
+from tests.algorithms.playing import assert_same, perceptron, play, spy_batches, weights_of
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 SEEDS = (4, 6)
-SIZE, N_TASKS = 16, 3  # of the ground truth, and tasks
+N_TASKS = 3
 both = pytest.mark.parametrize("name", ["maml", "dist-nll"])
 
 
@@ -27,15 +21,9 @@ def make(make_task_algorithm):
     return make_task_algorithm
 
 
-def networks(loss):
-    """The tensors of a loss that have a row for each task of each seed, by name."""
-    return {key: value for key, value in loss.state_dict().items() if value.ndim > 2}
-
-
 @both
 def test_training_episodes_are_played_by_the_network_of_their_task_with_noise(make, name):
-    algorithm, noise = make(name), generators(SEEDS, "exploration")
-    clamped, tasks = set(), set()
+    algorithm, noise, tasks = make(name), generators(SEEDS, "exploration"), set()
 
     def watch(chosen):
         for index, source in enumerate(noise):
@@ -44,16 +32,12 @@ def test_training_episodes_are_played_by_the_network_of_their_task_with_noise(ma
             action = perceptron(network, chosen["state"][index]).tanh()
             noisy = action + 0.3 * torch.randn(4, generator=source)
             torch.testing.assert_close(chosen["action"][index], noisy.clamp(-1, 1))
-            clamped.add(bool((noisy.abs() > 1).any()))
             tasks.add(task)
 
     play(algorithm, 40, watch=watch)
-    assert clamped == {True, False}
     assert tasks == {0, 1, 2}
-    ours, theirs = (
-        weights_of(algorithm.learner.loss.actor_network_params, 0, task) for task in (0, 1)
-    )
-    assert not ours["mlp.layers.1.weight"].equal(theirs["mlp.layers.1.weight"])
+    networks = weights_of(algorithm.learner.loss.actor_network_params, 0)["mlp.layers.1.weight"]
+    assert not networks[0].equal(networks[1])
 
 
 @both
@@ -105,9 +89,8 @@ def test_tasks_can_share_a_batch_in_equal_parts(make, name):
 def test_networks_stay_as_they_were_until_there_is_data_of_their_task(make, name):
     """But for MAML's policies, which start from one that learns from all tasks."""
     algorithm = make(name)
-    own = [
-        v for key, v in networks(algorithm.learner.loss).items() if name != "maml" or "value" in key
-    ]
+    of_tasks = {k: v for k, v in algorithm.learner.loss.state_dict().items() if v.ndim > 2}
+    own = [v for key, v in of_tasks.items() if name != "maml" or "value" in key]
     start = [value.clone() for value in own]
     counts, learned = torch.zeros(2, N_TASKS).long(), torch.zeros(2, N_TASKS).bool()
     stages, state = [], algorithm.world.env.reset()

@@ -1,9 +1,9 @@
 """Datasets of demonstrations: damaged ones, and those that are written from elsewhere."""
 
+import os
 import shutil
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,30 +20,17 @@ from bgpo_trl.data.dataset import (
 )
 from tests.helpers import contents, edit
 
-KEYS = {"pixels", "state", "action", "length", "task", "train", "seed"}
-
-
-def truncate(path: Path) -> None:
-    with open(path / "pixels.memmap", "r+b") as file:
-        file.truncate(1000)
-
 
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (truncate, r"pixels\.memmap is missing or truncated"),
+        (lambda p: os.truncate(p / "pixels.memmap", 1000), r"memmap is missing or truncated"),
         (lambda p: (p / "dataset.json").write_text("{"), r"dataset\.json is damaged"),
         (lambda p: (p / "dataset.json").unlink(), "not a dataset of demonstrations"),
         (lambda p: edit(p / "dataset.json", checksum=None), "not complete; resume it"),
         (lambda p: edit(p / "dataset.json", scene_version="old"), "recorded in scene 'old'"),
-        (
-            lambda p: edit(p / "dataset.json", action_size=3),
-            "and actions of 3 numbers",
-        ),
-        (
-            lambda p: edit(p / "dataset.json", frame_shape=[8, 8]),
-            r"frames of \[8, 8\] and actions",
-        ),
+        (lambda p: edit(p / "dataset.json", action_size=3), "and actions of 3 numbers"),
+        (lambda p: edit(p / "dataset.json", frame_shape=[8, 8]), r"frames of \[8, 8\] and actions"),
     ],
 )
 def test_what_is_not_whole_is_refused_in_one_line(copy, damage, message):

@@ -38,7 +38,7 @@ def show(replay, *shown):
 
 @pytest.fixture
 def make_shown(bank):
-    def make_shown(**options):
+    def make_shown(bank=bank, **options):
         replay = make(bank.seen(), **options)
         show(
             replay,
@@ -49,11 +49,6 @@ def make_shown(bank):
         return replay
 
     return make_shown
-
-
-@pytest.fixture
-def shown(make_shown):
-    return make_shown()
 
 
 GROUP = torch.tensor([[0, 0, 1, -1, 2], [0, 2, 2, 0, 1]])
@@ -103,9 +98,10 @@ def test_transitions_are_the_steps_of_what_was_shown_in_the_rows_group(make_show
         assert found[key] == every
 
 
-def test_what_is_to_be_imitated_are_the_same_draws_with_noise_on_the_states_alone(make_shown):
-    """A seed's own noise, however many slots are free."""
-    plain, quiet, noisy, wide = (make_shown(n_steps=3, noise=x) for x in (0.3, 0.0, 0.4, 0.4))
+def test_what_is_to_be_imitated_are_the_same_draws_with_noise_on_the_states_alone(make_shown, bank):
+    """A seed's own noise, however many slots are free; by default, as much as the bank says."""
+    plain, quiet, wide = (make_shown(n_steps=3, noise=x) for x in (0.3, 0.0, 0.4))
+    noisy = make_shown(replace(bank, noise=0.4), n_steps=3)
     group = torch.zeros(2, 4_000, dtype=torch.int64)
     sampled, still, drawn = (
         plain.draw(group),

@@ -144,38 +144,45 @@ def test_frames_of_another_size_are_resized_if_asked(written, tmp_path):
         write_demonstrations(tmp_path / "own", small, scene="nico", held_out_per_task=1)
 
 
+INFO, TASK_FILE = "meta/info.json", "meta/tasks.parquet"
+IMAGE = {"dtype": "image", "shape": [32, 64, 3], "names": None}
+
+
 def edit_rows(path, change, file=DATA):
     rows = pq.read_table(path / file).to_pandas()
     pq.write_table(pa.Table.from_pandas(change(rows)), path / file)
 
 
-def without(row):
-    return lambda path: edit_rows(path, lambda rows: rows.drop(index=row))
+def without(file=DATA, **dropped):
+    return lambda path: edit_rows(path, lambda rows: rows.drop(**dropped), file)
+
+
+def replaced(column, values, file=DATA):
+    return lambda path: edit_rows(path, lambda rows: rows.assign(**{column: values}), file)
 
 
 def edit_info(**changes):
     return lambda path: edit(path / INFO, **changes)
 
 
-def replaced(column, values):
-    return lambda path: edit_rows(path, lambda rows: rows.assign(**{column: values}))
+def add_feature(path, name, feature):
+    features = json.loads((path / INFO).read_text())["features"]
+    edit(path / INFO, features={**features, name: feature})
 
 
-def png(width):
-    return saved(Image.new("RGB", (width, 8)))
-
-
-INFO, TASK_FILE = "meta/info.json", "meta/tasks.parquet"
-IMAGE = {"dtype": "image", "shape": [32, 64, 3], "names": None}
+def saved(image, kind="png"):
+    content = io.BytesIO()
+    image.save(content, kind)
+    return content.getvalue()
 
 
 @pytest.mark.parametrize(
     ("damage", "cause", "remedy"),
     [
-        (without(6), "episode 1", "has 1 of 2 frames"),
-        (without([5, 6]), "3 by meta/episodes and 2 by data, episodes 1", "get it again"),
+        (without(index=6), "episode 1", "has 1 of 2 frames"),
+        (without(index=[5, 6]), "3 by meta/episodes and 2 by data, episodes 1", "get it again"),
         (
-            lambda p: edit_rows(p, lambda rows: rows.drop(index=1), EPISODES),
+            without(EPISODES, index=1),
             "2 by meta/episodes and 3 by data, episodes 1",
             "get it again",
         ),
@@ -197,14 +204,10 @@ IMAGE = {"dtype": "image", "shape": [32, 64, 3], "names": None}
             "tasks.parquet",
         ),
         (replaced("task_index", range(11)), "has the tasks [0, 1, 2, 3, 4]", "one task"),
-        (
-            lambda p: edit_rows(p, lambda rows: rows.drop(columns="frame_index")),
-            "file-000.parquet is damaged or of another format",
-            "frame_index",
-        ),
+        (without(columns="frame_index"), "damaged or of another format", "frame_index"),
         (replaced(CAMERA, [{"bytes": b"PNG"}] * 11), "episode 0", "is damaged"),
         (
-            lambda p: replaced(CAMERA, [{"bytes": png(width)} for width in range(1, 12)])(p),
+            replaced(CAMERA, [{"bytes": saved(Image.new("RGB", (w, 8)))} for w in range(1, 12)]),
             "episode 0",
             "differ in size, [8, 1, 3] and [8, 2, 3]: make them alike",
         ),
@@ -233,6 +236,7 @@ def test_unknown_features_are_refused(written, refused, monkeypatch):
         ({"stride": 2}, "say how actions become one"),
         ({"stride": 0}, "stride 0"),
         ({"success_key": "next.sucess"}, "no 'next.sucess', by which .*: give one of its features"),
+        ({"logged": True}, "no 'next.success', .*success_key"),
     ):
         with pytest.raises(ValueError, match=cause):
             read_lerobot(written, **wrong)
@@ -244,9 +248,7 @@ def test_unknown_features_are_refused(written, refused, monkeypatch):
 
 
 def test_failed_episodes_are_no_demonstrations_unless_asked_for(written, refused):
-    features = json.loads((written / INFO).read_text())["features"]
-    success = {"dtype": "bool", "shape": [1], "names": None}
-    edit_info(features={**features, "next.success": success})(written)
+    add_feature(written, "next.success", {"dtype": "bool", "shape": [1], "names": None})
     outcomes = [False] * 4 + [True] + [False] * 6  # of the first episode alone
     replaced("next.success", outcomes)(written)
     refused(lambda: read_lerobot(written), "failed, without 'next.success': 1, 2", "episodes=...")
@@ -261,16 +263,11 @@ def test_failed_episodes_are_no_demonstrations_unless_asked_for(written, refused
 @pytest.mark.parametrize("value", [np.nan, -0.5, 2])
 def test_numbers_that_are_no_success_are_refused(written, refused, value):
     """A reward, or NaN, is true to Python."""
-    features = json.loads((written / INFO).read_text())["features"]
-    edit_info(features={**features, "next.success": {"dtype": "float32", "shape": [1]}})(written)
+    add_feature(written, "next.success", {"dtype": "float32", "shape": [1]})
     replaced("next.success", [0.0, value] + [1.0] * 9)(written)
     for logged in (False, True):
         call = partial(read_lerobot, written, logged=logged)
         refused(call, f"has the success {float(value)}, which is neither", "success_key")
-
-
-def test_logged_episodes_without_success_are_refused(written, refused):
-    refused(lambda: read_lerobot(written, logged=True), "no 'next.success'", "success_key")
 
 
 def test_some_episodes_tasks_and_frames_are_read(written):
@@ -298,12 +295,6 @@ def test_tasks_and_numbers_may_be_stored_as_other_libraries_do(written):
             np.testing.assert_array_equal(one["pixels"], other["pixels"])
 
 
-def saved(image, kind="png"):
-    content = io.BytesIO()
-    image.save(content, kind)
-    return content.getvalue()
-
-
 def test_images_may_lie_in_files_of_the_dataset_alone(written):
     expected = read_lerobot(written)[TASKS[0]][0]["pixels"]
     rows = pq.read_table(written / DATA).to_pandas()
@@ -320,7 +311,7 @@ def test_images_may_lie_in_files_of_the_dataset_alone(written):
 
 
 SIZE = (64, 32)
-CLEAR = Image.new("RGBA", SIZE, (10, 20, 30, 128))
+COLOR = (10, 20, 30)
 
 
 @pytest.mark.parametrize(
@@ -329,7 +320,7 @@ CLEAR = Image.new("RGBA", SIZE, (10, 20, 30, 128))
         (saved(Image.new("I;16", SIZE, 3_000)), "of mode I;16, of more than 8 bits"),
         (saved(Image.new("I", SIZE, 3_000), "tiff"), "of mode I, of more than 8 bits"),
         (saved(Image.new("F", SIZE, 0.5), "tiff"), "of mode F, of more than 8 bits"),
-        (saved(CLEAR), "its images are transparent"),
+        (saved(Image.new("RGBA", SIZE, (*COLOR, 128))), "its images are transparent"),
     ],
 )
 def test_images_that_would_have_to_be_converted_are_refused(written, refused, content, cause):
@@ -339,21 +330,14 @@ def test_images_that_would_have_to_be_converted_are_refused(written, refused, co
 
 
 def test_gray_opaque_and_palette_images_are_exact(written):
-    plain = Image.new("RGB", SIZE, (10, 20, 30))
-    gray = Image.new("L", SIZE, 7)
-    for image, color in (
-        (gray, 7),
-        (plain.convert("RGBA"), (10, 20, 30)),
-        (plain.quantize(), (10, 20, 30)),
-    ):
+    plain, gray = Image.new("RGB", SIZE, COLOR), Image.new("L", SIZE, 7)
+    for image, color in ((gray, 7), (plain.convert("RGBA"), COLOR), (plain.quantize(), COLOR)):
         replaced(CAMERA, [{"bytes": saved(image)}] * 11)(written)
         assert (read_lerobot(written)[TASKS[0]][0]["pixels"] == color).all()
 
 
 def test_depth_maps_are_no_cameras(written):
-    features = json.loads((written / INFO).read_text())["features"]
-    depth = {**IMAGE, "info": {"is_depth_map": True}}
-    edit_info(features={**features, "depth": depth})(written)
+    add_feature(written, "depth", {**IMAGE, "info": {"is_depth_map": True}})
     assert {*read_lerobot(written)} == {*TASKS}  # the other camera is the only one
     with pytest.raises(ValueError, match=f"has a depth map 'depth'.*{CAMERA}"):
         read_lerobot(written, image_key="depth")
@@ -429,12 +413,11 @@ def film(written, monkeypatch):
         else:
             file.touch()
             monkeypatch.setitem(sys.modules, "av", StandIn(kept, pix_fmt))
-        edit_rows(written, lambda rows: rows.drop(columns=CAMERA))
+        without(columns=CAMERA)(written)
         places = {"chunk_index": 0, "file_index": 0, "from_timestamp": (0.0, 1.0, 1.4)}
         places = {f"videos/{CAMERA}/{key}": value for key, value in places.items()}
         edit_rows(written, lambda rows: rows.assign(**places), EPISODES)
-        features = json.loads((written / INFO).read_text())["features"]
-        edit_info(features={**features, CAMERA: {**IMAGE, "dtype": "video"}})(written)
+        add_feature(written, CAMERA, {**IMAGE, "dtype": "video"})
         return file
 
     return make
@@ -471,8 +454,7 @@ def test_a_video_that_lacks_a_frame_is_refused(written, film, refused, gap, epis
 
 def test_episodes_that_overlap_in_a_video_are_refused(written, film, refused):
     film()
-    start = f"videos/{CAMERA}/from_timestamp"
-    edit_rows(written, lambda rows: rows.assign(**{start: (0.0, 0.8, 1.4)}), EPISODES)
+    replaced(f"videos/{CAMERA}/from_timestamp", (0.0, 0.8, 1.4), EPISODES)(written)
     cause = "begins in another one's frames, at 0.800 s"
     refused(lambda: read_lerobot(written, episodes=[0]), cause, "get it again")
 

@@ -178,16 +178,6 @@ def test_shipped_demonstrations_are_not_copied(shipped, tmp_path, tasks):
     assert (found.tasks, found.identity) == (tasks, bank.identity)
 
 
-def test_own_demonstrations_move_with_the_run(shipped, mixed, tmp_path):
-    encoders, _ = shipped
-    (tmp_path / "run").mkdir()
-    keep_inputs(tmp_path / "run", mixed, encoders)
-    (tmp_path / "run").rename(tmp_path / "moved")
-    digests = Digests(encoders.identity, mixed.identity)
-    found = load_inputs(tmp_path / "moved", mixed.tasks, digests)[1]
-    assert (found.tasks, found.identity) == (mixed.tasks, mixed.identity)
-
-
 def test_inputs_of_another_run_or_scene_are_refused(shipped, mixed, tmp_path):
     encoders, bank = shipped
     digests = Digests(encoders.identity, mixed.identity)

@@ -205,14 +205,6 @@ def test_a_small_thing_that_is_lost_counts_as_much_as_a_large_one_that_is_seen()
     assert share_lost(background[None], background[None], background) == 0
 
 
-def test_things_that_are_lost_are_complained_of():
-    good = {"task_accuracy_nearest": 1.0, "task_accuracy_chance": 0.5}
-    seen = {**good, "moving_reconstruction": 0.6}
-    assert complaints({**seen, "things_lost": 0.08}) == []
-    (line,) = complaints({**seen, "things_lost": 0.47})
-    assert line.startswith("47 % of the things that stand out in frames are not reconstructed")
-
-
 def test_the_verdict_judges_by_the_bounds_of_the_complaints(tmp_path):
     good = {"moving_reconstruction": 0.5, "things_lost": 0.1, "task_accuracy_nearest": 0.9}
     good |= {"inverse_r2": 0.5, "task_accuracy_chance": 0.5}

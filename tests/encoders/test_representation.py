@@ -169,18 +169,15 @@ def test_play_is_held_out_only_where_it_is_probed(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"recorded play has no held-out .* held_out_per_task of"):
         train_encoders(*arguments, tasks=TASKS, scene=NICO)
     assert not [*tmp_path.iterdir()]  # nothing was trained before
-    trained, _ = train_encoders(*arguments, tasks=TASKS, scene=blind)
-    together = torch.cat([valid_frames(squares(8)[squares(8)["train"]]), valid_frames(play)])
-    torch.testing.assert_close(trained.frame_network.mean_frame, mean_frame(together))
+    train_encoders(*arguments, tasks=TASKS, scene=blind)
     play["train"] = torch.zeros(10, dtype=torch.bool)
     with pytest.raises(ValueError, match="recorded play has no episodes to train on"):
         train(squares(8), play=play)
 
 
-def test_the_frame_encoder_learns_from_the_training_part_of_play(tiny: Representation) -> None:
+def test_the_frame_encoder_learns_from_the_training_part_of_play() -> None:
     play = squares(10)
     trained, held_out_changed = train(squares(8), play=play), play.clone()
-    assert not trained.frame_network.mean_frame.equal(tiny.frame_network.mean_frame)
     together = torch.cat([valid_frames(d[d["train"]]) for d in (squares(8), play)])
     torch.testing.assert_close(trained.frame_network.mean_frame, mean_frame(together))
     held_out_changed["pixels"][~play["train"]] = 0

@@ -1,15 +1,9 @@
 """Groups of behaviors: which group an input belongs to as demonstrations are shown."""
 
-from itertools import combinations
-
-import numpy as np
 import pytest
 import torch
 
-from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
-from bgpo_trl.transforms import TaskSchedule
-from suites import nico
 
 PLACES = 12.0 * torch.eye(4)
 
@@ -235,78 +229,6 @@ def test_a_part_of_a_joined_group_parts_unless_the_groups_expert_solves_it(
     for each in (groups, restored):
         show(each, draw(40, place=-40.0))  # of what nobody has solved
         assert len(each.numbers) == n_groups + 1
-
-
-def test_eight_of_fifty_demonstrations_are_a_group_and_eight_of_thirty_are_not():
-    groups, few = BehaviorGroups(4), around(1, 8)
-    show(groups, torch.cat([around(0, 22), few]))
-    assert groups.numbers == [0]
-    show(groups, around(0, 20, seed=1))
-    assert groups.numbers == [0, 1]
-    assert group_of(groups, few) == [1]
-
-
-# ---- the shipped banks
-
-
-@pytest.mark.parametrize("order", ["reversed", "from the start"])
-def test_groups_of_shipped_demonstrations_contain_one_task_each(order):
-    """Draws as in a run; labels are used for the draws and the count alone.
-
-    A task looks different from either side of the table, so that it may have two groups; two of all
-    may be in pieces.
-    """
-    n_tasks, each = len(nico.PAPER_TASKS), 120
-    bank = load_pretrained(tasks=nico.PAPER_TASKS)[1]
-    seen, held_out = bank.seen(), bank.held_out()
-    starts = [0 if order == "from the start" else each * task for task in range(n_tasks)]
-    schedule = TaskSchedule(tuple(starts[::-1] if order == "reversed" else starts))
-    rows = [np.flatnonzero(seen.task == task) for task in range(n_tasks)]
-    rng = np.random.default_rng(0)
-    groups = BehaviorGroups(32)
-    for available in schedule.available(torch.arange(each * n_tasks + 60)):
-        task = rng.choice(available.nonzero().flatten())
-        groups.adapt(seen.embedding[int(rng.choice(rows[task]))])
-    assert n_tasks <= len(groups.numbers) <= 2 * n_tasks + 2
-    group = groups.lookup(held_out.embedding).group
-    majority = {int(g): held_out.task[group == g].mode().values.item() for g in group.unique()}
-    assert {*majority.values()} == {*range(n_tasks)}
-    of_group = torch.tensor([majority[int(g)] for g in group])
-    assert float((of_group == held_out.task).float().mean()) > 0.99
-
-
-@pytest.mark.parametrize("seed", [0, 2])
-def test_groups_joined_while_a_task_begins_do_not_swallow_it(seed):
-    """Groups of a task are joined 25 episodes after another begins, before it has its own group.
-
-    The expert of a group solves half of the episodes of the task that it has been shown most, and
-    few of others.
-    """
-    bank = load_pretrained()[1]
-    seen, held_out = bank.seen(), bank.held_out()
-    rows = [np.flatnonzero(seen.task == task) for task in range(3)]
-    rng, groups, tasks = np.random.default_rng(seed), BehaviorGroups(32), list[int]()
-
-    def task_of(group):
-        shown = np.array(tasks)[groups.group[: len(tasks)] == group]
-        return np.bincount(shown, minlength=3).argmax()
-
-    for episode, known in enumerate(TaskSchedule((0, 200, 400)).available(torch.arange(700))):
-        task = int(rng.choice(known.nonzero().flatten()))
-        group = int(groups.adapt(seen.embedding[int(rng.choice(rows[task]))]).group)
-        tasks += [task] * (len(groups.points) - len(tasks))
-        success = rng.random() < (0.5 if task_of(group) == task else 0.07)
-        groups.end(group, group, fits=True, success=success)
-        if episode in (225, 425, 600):
-            while same := [
-                pair
-                for pair in combinations(groups.numbers, 2)
-                if task_of(pair[0]) == task_of(pair[1])
-            ]:
-                groups.join(*same[0])
-    assert len(groups.numbers) == 3
-    group = groups.lookup(held_out.embedding).group
-    assert len({*zip(group.tolist(), held_out.task.tolist(), strict=True)}) == 3
 
 
 def test_vectors_embedded_twice_are_one_demonstration_whatever_their_rounding():

@@ -22,13 +22,18 @@ def frames(*batch: int) -> torch.Tensor:
     return torch.randint(0, 256, (*batch, 32, 64, 3), dtype=torch.uint8, generator=generator)
 
 
-def test_the_encoder_is_that_of_the_paper(vae: VAE) -> None:
+def plain_convolutions(vae: VAE, pixels: torch.Tensor) -> torch.Tensor:
     """Plain reference: NCHW, three times convolution, ReLU, pooling, in the paper's order."""
-    pixels = frames(5)
     x = (pixels.float() / 255 - vae.mean_frame).permute(0, 3, 1, 2).contiguous()
-    for layer, channels in zip(vae.encoder, (32, 64, 128), strict=True):
-        assert layer.weight.shape[0] == channels
+    for layer in vae.encoder:
         x = F.max_pool2d(F.relu(F.conv2d(x, layer.weight.contiguous(), layer.bias, padding=1)), 2)
+    return x
+
+
+def test_the_encoder_is_that_of_the_paper(vae: VAE) -> None:
+    pixels = frames(5)
+    x = plain_convolutions(vae, pixels)
+    assert [layer.weight.shape[0] for layer in vae.encoder] == [32, 64, 128]
     assert x.shape[1:] == (128, 4, 8)
     mu, log_variance = vae.encode(pixels)
     torch.testing.assert_close(mu[:, 32:], vae.mean_head(x.flatten(1)))
@@ -36,15 +41,11 @@ def test_the_encoder_is_that_of_the_paper(vae: VAE) -> None:
     assert mu.shape == log_variance.shape == (5, 64)
 
 
-def test_without_keypoints_all_means_are_those_of_a_dense_layer() -> None:
-    """Plain reference of encoder and decoder, layer by layer."""
+def test_without_keypoints_means_are_those_of_a_dense_layer_and_decoded_by_layers() -> None:
     torch.manual_seed(0)
     vae, pixels = VAE(keypoints=False), frames(5)
-    x = (pixels.float() / 255 - 0.5).permute(0, 3, 1, 2).contiguous()
-    for layer in vae.encoder:
-        x = F.max_pool2d(F.relu(F.conv2d(x, layer.weight.contiguous(), layer.bias, padding=1)), 2)
     mu = vae.encode(pixels)[0]
-    torch.testing.assert_close(mu, vae.mean_head(x.flatten(1)))
+    torch.testing.assert_close(mu, vae.mean_head(plain_convolutions(vae, pixels).flatten(1)))
     assert mu.shape == (5, 64)
     x = F.relu(vae.decoder_dense(mu)).unflatten(-1, (128, 4, 8))
     for layer in vae.decoder[:-1]:

@@ -44,7 +44,7 @@ class Reference:
             return self.create(phi), phi, 1.0
         ranked = sorted(self.weights, key=lambda node: (math.dist(phi, self.weights[node]), node))
         c, matched = ranked[0], self.weights[ranked[0]]
-        activity = math.exp(-math.dist(phi, matched))
+        activity = math.exp(-self.config.activity_scale * math.dist(phi, matched))
         if len(ranked) == 1:
             self.edges[frozenset((c, self.create(phi)))] = 0
             return c, matched, activity
@@ -125,17 +125,12 @@ def assert_same(a, b):
     [
         (TABLE_1, None),
         (GROWING, None),
-        (GWRBConfig(activity_threshold=0.9, habituation_threshold=0.6, max_age=1), 12),
-        (
-            GWRBConfig(
-                activity_threshold=0.9, habituation_threshold=0.6, max_age=2, tau_neighbor=2.0,
-                lr_best=0.5,
-            ),
-            None,
-        ),
+        (replace(GROWING, max_age=1), 12),
+        (replace(GROWING, tau_neighbor=2.0, lr_best=0.5), None),
+        (replace(GROWING, activity_scale=4.0), None),
     ],
-    ids=["table 1", "growing", "capped", "fast"],
-)  # fmt: skip
+    ids=["table 1", "growing", "capped", "fast", "scaled"],
+)
 @pytest.mark.parametrize("init", ["random", "data"])
 def test_masked_batch_follows_the_plain_reference(config, max_nodes, init):
     generator = torch.Generator().manual_seed(0)
@@ -172,30 +167,6 @@ def test_masked_batch_follows_the_plain_reference(config, max_nodes, init):
 
 
 # ---- the equations, by hand
-
-
-@pytest.mark.parametrize("scale", [0.25, 4.0])  # powers of two: nothing is rounded otherwise
-def test_activity_scale_has_the_effect_of_scaled_inputs(scale):
-    scaled, plain = (
-        GWRB(3, replace(GROWING, activity_scale=s), batch_size=[2], init="data").double()
-        for s in (scale, 1.0)
-    )
-    inputs = drifting_inputs(500, 2, 3) * 0.5 / scale
-    for phi in inputs:
-        match, expected = scaled.adapt(phi), plain.adapt(scale * phi)
-        assert torch.equal(match.activity, expected.activity)
-        assert torch.equal(match.node, expected.node)
-        assert torch.equal(scale * match.embedding, expected.embedding)
-    for i in range(2):
-        graph, expected = scaled.graph(i), plain.graph(i)
-        torch.testing.assert_close(
-            graph._replace(weights=scale * graph.weights), expected, rtol=0, atol=0
-        )
-        assert graph.node[-1] > len(graph.node) > 5  # nodes were inserted, and some removed
-    unscaled = GWRB(3, GROWING, batch_size=[2], init="data").double()
-    for phi in inputs:
-        unscaled.adapt(phi)
-    assert not torch.equal(unscaled.num_nodes, plain.num_nodes)
 
 
 def test_best_match_and_neighbor_have_constants_of_their_own():

@@ -1,8 +1,7 @@
-"""The DDPG loss by hand, beside TorchRL's, and in training beside a plain DDPG."""
+"""The DDPG loss by hand; `test_bgpo_minimal` trains beside a plain DDPG."""
 
 import copy
 import math
-from functools import partial
 
 import pytest
 import torch
@@ -14,18 +13,53 @@ from torchrl.objectives.value import TD0Estimator
 from bgpo_trl.configs import RLConfig
 from bgpo_trl.modules.actor_critic import Actor, Critic, ProposalPolicy
 from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
-from tests.objectives.losses import (
-    ACTION,
-    STATE,
-    constant_critics,
-    every_loss,
-    gradients,
-    make_batch,
-    make_loss,
-    total,
-)
+from tests.algorithms.playing import make_batch
 
-BOTH_INPUTS = ("state", "label")
+STATE, ACTION = 6, 4
+N_CRITICS = {"ddpg": 1, "ensemble": 3, "clone": 3}
+every_loss = pytest.mark.parametrize("name", N_CRITICS)
+
+
+def make_loss(name, seed=0, *, stack=(), **options):
+    """Make a loss, by default without a stack of seeds."""
+    n_critics, source = N_CRITICS[name], torch.Generator().manual_seed(seed)
+    network = {"in_keys": ["state"], "hidden_sizes": (16,), "generator": source}
+
+    def actor():
+        return Actor(STATE, ACTION, batch_size=stack, **network)
+
+    ensemble = (n_critics,) if n_critics > 1 else ()
+    critic = Critic(STATE, ACTION, batch_size=(*stack, *ensemble), **network)
+    clone = actor() if name == "clone" else None
+    loss = DDPGLoss(actor(), critic, clone, n_critics=n_critics, **options)
+    loss.make_value_estimator(gamma=0.98)
+    ForeachSoftUpdate(loss, tau=0.005)
+    return loss
+
+
+def gradients(loss, batch):
+    loss.zero_grad()
+    sum(value for key, value in loss(batch).items() if key.startswith("loss_")).backward()
+    return [parameter.grad.clone() for parameter in loss.parameters()]
+
+
+def targets_of(loss):
+    parts = (loss.target_actor_network_params, loss.target_value_network_params)
+    return [tensor for part in parts for tensor in part.values(True, True)]
+
+
+def constant_critics(loss, online, target):
+    """Make Q equal to ``online`` and target Q to ``target`` everywhere; triples for ensembles."""
+    for parameters, values in (
+        (loss.value_network_params, online),
+        (loss.target_value_network_params, target),
+    ):
+        for tensor in parameters.values(True, True):
+            tensor.data.zero_()
+        bias = parameters["mlp", "layers", "1", "bias"]
+        bias.data.copy_(torch.tensor(values).unsqueeze(-1))
+
+
 # reward, done, terminated -> target with gamma 0.98 and a next value of 0.3
 TRANSITIONS = [
     (0.0, False, False, 0.294),
@@ -158,28 +192,6 @@ def test_the_policy_takes_the_actors_proposal_if_critics_agree_that_it_gains(
         torch.testing.assert_close(action[..., 0], torch.full(shape, chosen))
 
 
-def test_a_stack_of_policies_chooses_for_each_as_one_would():
-    source = torch.Generator().manual_seed(0)
-
-    def network(kind, *ensemble):
-        shape = {"hidden_sizes": (16,), "batch_size": (4, *ensemble)}
-        return kind(STATE, ACTION, in_keys=["state"], generator=source, **shape)
-
-    stack = ProposalPolicy(network(Actor), network(Actor), network(Critic, 3))
-    stack.only_clone[1] = True
-    state = torch.randn(4, 200, STATE, generator=source)
-    together = stack(TensorDict({"state": state}, (4, 200)))["action"]
-    names = [*stack.state_dict()]
-    for row in range(4):
-        weights = {name: stack.state_dict()[name][row] for name in names}
-        data = TensorDict({"state": state[row]}, 200)
-        alone = torch.func.functional_call(stack, weights, (data,))["action"]
-        torch.testing.assert_close(together[row], alone)
-    cloned = stack.clone(TensorDict({"state": state}, (4, 200)))["action"]
-    taken = (together == cloned).all(-1).float().mean(-1)
-    assert taken[1] == 1 and (taken[[0, 2, 3]] < 1).all() and (taken > 0).all()
-
-
 @pytest.mark.parametrize(
     ("name", "part", "weight"), [("clone", "clone", 1), ("ddpg", "actor", 0.7)]
 )
@@ -199,7 +211,7 @@ def test_imitation_is_the_distance_to_demonstrated_actions_with_its_weight(name,
 
 def test_the_imitation_of_each_actor_fades_with_its_own_updates():
     options = {"imitation": 0.7, "imitation_half_life": 2.0, "reduction": "none"}
-    loss = make_loss("ddpg", seeds=(0, 1), stacked=True, **options)
+    loss = make_loss("ddpg", stack=(2,), **options)
     batch = make_batch(2, 6)
     batch["priority_weight"] = torch.tensor([[1.0], [0.0]]).expand(2, 6)
     shown = batch["imitation"]
@@ -212,82 +224,6 @@ def test_the_imitation_of_each_actor_fades_with_its_own_updates():
     # The first actor has had four updates, the other one, without transitions, none.
     faded = torch.tensor([0.7 - 0.7 / 4, 0.0]) * distance
     torch.testing.assert_close(before - loss(batch)["loss_actor"], faded)
-
-
-def test_without_options_it_is_torchrls_loss():
-    loss = make_loss("ddpg", pre_tanh_penalty=0.0)
-    actor, critic = copy.deepcopy(loss.actor_network), copy.deepcopy(loss.value_network)
-    reference = objectives.DDPGLoss(actor, critic, delay_actor=True)
-    reference.make_value_estimator(objectives.ValueEstimators.TD0, gamma=0.98)
-    objectives.SoftUpdate(reference, tau=0.005)
-    batch = make_batch(16)
-    mine, theirs = loss(batch.clone()), reference(batch.clone())
-    for key in ("loss_actor", "loss_value"):
-        torch.testing.assert_close(mine[key], theirs[key], rtol=1e-4, atol=1e-5)
-    total(mine).backward()
-    total(theirs).backward()
-    for ours, other in zip(loss.parameters(), reference.parameters(), strict=True):
-        torch.testing.assert_close(ours.grad, other.grad, rtol=1e-3, atol=1e-5)
-
-
-@every_loss
-def test_each_seed_of_a_stack_learns_as_it_does_alone(name):
-    close = partial(torch.testing.assert_close, rtol=1e-4, atol=1e-4)
-    seeds = (0, 1, 2)
-    stacked, *alone = losses = [
-        make_loss(name, seeds, stacked=True),
-        *(make_loss(name, (seed,)) for seed in seeds),
-    ]
-    optimizers = [torch.optim.Adam(list(loss.parameters()), lr=1e-3) for loss in losses]
-    updates = [ForeachSoftUpdate(loss, tau=0.005) for loss in losses]
-    for step in range(10):
-        batch = make_batch(len(seeds), 32, seed=step)
-        results = [loss(data) for loss, data in zip(losses, [batch, *batch.unbind(0)], strict=True)]
-        for loss, result in zip(losses, results, strict=True):
-            loss.zero_grad()
-            total(result).backward()
-        for key, together in results[0].items():
-            apart = torch.stack([result[key] for result in results[1:]])
-            close(together, apart.sum(0) if key.startswith("loss_") else apart)
-        for index, one in enumerate(alone):
-            for ours, theirs in zip(stacked.parameters(), one.parameters(), strict=True):
-                if step == 0:
-                    torch.testing.assert_close(ours.grad[index], theirs.grad)
-                close(ours[index], theirs)
-        for optimizer, update in zip(optimizers, updates, strict=True):
-            optimizer.step()
-            update.step()
-
-
-@every_loss
-def test_each_network_learns_from_its_own_loss(name):
-    loss = make_loss(name)
-    parts = {
-        "loss_actor": list(loss.actor_network_params.parameters()),
-        "loss_value": list(loss.value_network_params.parameters()),
-        **({"loss_clone": [*loss.clone_network_params.parameters()]} if name == "clone" else {}),
-    }
-    for key, learning in parts.items():
-        loss.zero_grad()
-        loss(make_batch(16))[key].backward()
-        for other, parameters in parts.items():
-            for parameter in parameters:
-                assert (parameter.grad is None) == (other != key)
-        assert all(parameter.grad.any() for parameter in learning)
-
-
-@every_loss
-def test_constant_entries_are_not_needed_under_next(name):
-    plain = make_loss(name, in_keys=BOTH_INPUTS)
-    lean = make_loss(name, in_keys=BOTH_INPUTS, constant_keys=["label"])
-    batch = make_batch(8)
-    without = batch.exclude(("next", "label"))
-    with pytest.raises(ValueError, match="under 'next', found no 'label'"):
-        plain(without)
-    target = lean(without)["target_value"]
-    batch["next", "label"] = batch["label"]
-    fresh = make_loss(name, in_keys=BOTH_INPUTS)  # whose turn it is with the same pair
-    torch.testing.assert_close(target, fresh(batch)["target_value"])
 
 
 @every_loss
@@ -346,7 +282,7 @@ def test_targets_of_several_steps_are_discounted_as_often(name):
 def test_a_copied_or_cast_loss_still_follows_its_parameters(name, change):
     loss, batch = make_loss(name), make_batch(16)
     loss(batch.clone())  # networks that were made for it must not outlive the change
-    loss, fresh = change(loss), make_loss(name, (1,))
+    loss, fresh = change(loss), make_loss(name, seed=1)
     loss.load_state_dict(fresh.state_dict())
     mine, theirs = loss(batch.clone()), fresh(batch.clone())
     for key, value in theirs.items():
@@ -356,21 +292,17 @@ def test_a_copied_or_cast_loss_still_follows_its_parameters(name, change):
 
 
 @every_loss
-def test_soft_updates_are_torchrls_also_after_a_cast(name):
-    losses = make_loss(name), make_loss(name)
-    updates = ForeachSoftUpdate(losses[0], tau=0.1), objectives.SoftUpdate(losses[1], tau=0.1)
-    before = losses[0].target_value_network_params.clone()
-    for loss, update in zip(losses, updates, strict=True):
-        loss.double()
-        for parameter in loss.parameters():
-            parameter.data.add_(1.0)
-        for _ in range(3):
-            update.step()
-    expected = losses[1].state_dict()
-    for entry, value in losses[0].state_dict().items():
-        torch.testing.assert_close(value, expected[entry])
-    moved = losses[0].target_value_network_params.sub(before).values(True, True)
-    assert all(torch.allclose(value, torch.full_like(value, 1 - 0.9**3)) for value in moved)
+def test_targets_follow_by_a_share_also_after_a_cast(name):
+    loss = make_loss(name)
+    update = ForeachSoftUpdate(loss, tau=0.1)
+    loss.double()
+    before = [target.clone() for target in targets_of(loss)]
+    for parameter in loss.parameters():
+        parameter.data.add_(1.0)
+    for _ in range(3):
+        update.step()
+    for target, old in zip(targets_of(loss), before, strict=True):
+        torch.testing.assert_close(target, old + 1 - 0.9**3)
 
 
 def test_bad_arguments_are_refused():
@@ -408,23 +340,6 @@ def test_weights_are_factors_of_each_transitions_losses():
     torch.testing.assert_close(result["loss_actor"], (weights * (penalty - value)).mean())
     loss.use_prioritized_weights = False
     torch.testing.assert_close(loss(batch)["loss_value"], error.mean())
-
-
-@pytest.mark.parametrize("layer_norm", [False, True])
-def test_seeds_of_weight_zero_have_no_gradient_and_change_no_others(layer_norm):
-    """`TaskReplay` gives zeros for tasks without data."""
-    loss = make_loss("ddpg", range(4), stacked=True, layer_norm=layer_norm)
-    batch, idle, active = make_batch(4, 32), [1, 3], [0, 2]
-    everything = gradients(loss, batch)
-    batch["priority_weight"] = torch.tensor([1.0, 0, 1, 0]).unsqueeze(-1).expand(4, 32).clone()
-    weighted = gradients(loss, batch)
-    for index in idle:
-        batch[index] = batch[index].apply(torch.zeros_like)
-    for grad, zeroed, unweighted in zip(weighted, gradients(loss, batch), everything, strict=True):
-        assert unweighted.flatten(1).any(-1).all()
-        for of_weighted in (grad, zeroed):
-            assert not of_weighted[idle].any()
-            assert of_weighted[active].equal(unweighted[active])
 
 
 def test_an_actor_without_pre_tanh_actions_needs_no_penalty_and_reports_no_magnitude():

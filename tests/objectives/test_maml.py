@@ -3,11 +3,11 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from torch.nn.functional import layer_norm
 
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
 from bgpo_trl.objectives.maml import MAMLLoss
+from tests.algorithms.playing import perceptron
 
 N_STATES, N_ACTIONS, TASKS = 3, 2, 3
 
@@ -46,86 +46,86 @@ def stack_loss(n_seeds=2, **arguments):
     return loss
 
 
-def plain_policy(weights, state):
-    first, first_bias, second, second_bias = weights
-    return (state @ first + first_bias).relu() @ second + second_bias
-
-
-def plain_critic(weights, state, action):
-    first, first_bias, second, second_bias = weights
-    hidden = torch.cat([state, action], -1) @ first + first_bias
-    return layer_norm(hidden, hidden.shape[-1:]).relu() @ second + second_bias
-
-
 def plain_policy_loss(policy, critic, state, penalty):
-    pre_tanh = plain_policy(policy, state)
-    value = plain_critic(critic, state, pre_tanh.tanh())
+    pre_tanh = perceptron(policy, state)
+    value = perceptron(critic, torch.cat([state, pre_tanh.tanh()], -1), normalize=True)
     return penalty * pre_tanh.square().mean() - value.mean()
 
 
 def plain_adapted(policy, critic, state, rate, penalty):
     loss = plain_policy_loss(policy, critic, state, penalty)
-    gradients = torch.autograd.grad(loss, policy, create_graph=True)
-    return [w - rate * gradient for w, gradient in zip(policy, gradients, strict=True)]
+    gradients = torch.autograd.grad(loss, [*policy.values()], create_graph=True)
+    steps = zip(policy.items(), gradients, strict=True)
+    return {key: w - rate * gradient for (key, w), gradient in steps}
 
 
-def one_of(parameters, *index):
-    """The weights of one network of a stack, layer by layer, each matrix before its bias."""
-    return [p[index].detach().clone().requires_grad_() for p in parameters]
+def by_name(parameters):
+    return dict(parameters.flatten_keys(".").items())
 
 
-def ordered(parameters):
-    """The values of a tensordict of parameters or of a dict of them, as `one_of` wants them."""
-    flat = parameters if isinstance(parameters, dict) else parameters.flatten_keys(".")
-    return [flat[f"mlp.layers.{i}.{name}"] for i in range(2) for name in ("weight", "bias")]
+def one_of(stack, *index):
+    """The weights of one network of a stack, by name."""
+    return {key: p[index].detach().clone().requires_grad_() for key, p in stack.items()}
 
 
 @pytest.mark.parametrize(("rate", "penalty"), [(0.0, 0.1), (0.5, 0.0), (0.5, 0.1)])
 def test_the_outer_loss_and_gradient_are_those_of_plain_autograd(rate, penalty):
     """Second derivatives through tanh and layer normalization included."""
     loss = stack_loss(inner_learning_rate=rate, pre_tanh_penalty=penalty)
+    meta, critics = dict(loss.meta_network.named_parameters()), by_name(loss.value_network_params)
     batch = transitions(2, TASKS, 8)
     halves = batch["state"].chunk(2, -2)
-    support_batch = batch[..., :4]
-    ours_adapted = ordered(loss.adapt(support_batch))
+    ours_adapted = loss.adapt(batch[..., :4])
     value, _ = loss.loss_actor(batch)
     value.backward()
     total = 0.0
     for seed in range(2):
-        start = one_of(loss.meta_network.parameters(), seed)
+        start = one_of(meta, seed)
         of_seed = 0.0
         for task in range(TASKS):
-            critic = one_of(loss.value_network_params.parameters(), seed, task)
+            critic = one_of(critics, seed, task)
             support, query = (half[seed, task] for half in halves)
             adapted = plain_adapted(start, critic, support, rate, penalty)
-            for ours, theirs in zip(ours_adapted, adapted, strict=True):
-                torch.testing.assert_close(ours[seed, task], theirs)
+            for key, theirs in adapted.items():
+                torch.testing.assert_close(ours_adapted[key][seed, task], theirs)
             of_seed = of_seed + plain_policy_loss(adapted, critic, query, penalty)
-        gradients = torch.autograd.grad(of_seed, start)
-        for ours, theirs in zip(loss.meta_network.parameters(), gradients, strict=True):
+        gradients = torch.autograd.grad(of_seed, [*start.values()])
+        for ours, theirs in zip(meta.values(), gradients, strict=True):
             torch.testing.assert_close(ours.grad[seed], theirs)
         total += of_seed.detach()
     torch.testing.assert_close(value.detach(), total)
 
 
+def test_the_meta_policy_learns_from_one_loss_and_the_critics_from_the_other():
+    loss, batch = stack_loss(inner_learning_rate=0.5), transitions(2, TASKS, 8)
+    policies = [*loss.meta_network.parameters()]
+    critics = [*loss.value_network_params.parameters()]
+    learned = [w for w in loss.parameters() if w.requires_grad]
+    assert {*map(id, learned)} == {*map(id, policies + critics)}
+    for value, learning in ((loss.loss_actor, policies), (loss.loss_value, critics)):
+        loss.zero_grad()
+        value(batch)[0].backward()
+        for weights in (policies, critics):
+            assert all((w.grad is not None) == (weights is learning) for w in weights)
+
+
 def test_target_actions_are_those_of_a_slow_copy_of_the_adapted_policies():
     loss = stack_loss(inner_learning_rate=0.5)
     target_update = ForeachSoftUpdate(loss, tau=0.25)
-    slow = [
-        w.detach().unsqueeze(1).expand(2, TASKS, *w.shape[1:]).clone()
-        for w in loss.meta_network.parameters()
-    ]
+    slow = {
+        key: w.detach().unsqueeze(1).expand(2, TASKS, *w.shape[1:]).clone()
+        for key, w in loss.meta_network.named_parameters()
+    }
     for seed in range(3):
         batch = transitions(2, TASKS, 8, seed=seed)
-        adapted = ordered(loss.adapt(batch[..., :4]))
+        adapted = loss.adapt(batch[..., :4])
         loss.loss_actor(batch)
         target_update.step()
-        slow = [0.75 * w + 0.25 * a.detach() for w, a in zip(slow, adapted, strict=True)]
+        slow = {key: 0.75 * w + 0.25 * adapted[key].detach() for key, w in slow.items()}
         with torch.no_grad():
             for w in [*loss.meta_network.parameters(), *loss.value_network_params.parameters()]:
                 w += 0.1  # as a step of the optimizer
-    for ours, theirs in zip(ordered(loss.target_actor_network_params), slow, strict=True):
-        torch.testing.assert_close(ours, theirs)
+    torch.testing.assert_close(by_name(loss.target_actor_network_params), slow)
 
     network = {"in_keys": ["state"], "hidden_sizes": (8,), "batch_size": [2, TASKS]}
     plain = DDPGLoss(
@@ -136,8 +136,8 @@ def test_target_actions_are_those_of_a_slow_copy_of_the_adapted_policies():
     ForeachSoftUpdate(plain, tau=0.1)
     plain.value_network_params.data.copy_(loss.value_network_params.data)
     plain.target_value_network_params.data.copy_(loss.target_value_network_params.data)
-    for ours, theirs in zip(ordered(plain.target_actor_network_params), slow, strict=True):
-        ours.data.copy_(theirs)
+    for key, target in by_name(plain.target_actor_network_params).items():
+        target.data.copy_(slow[key])
     batch = transitions(2, TASKS, 8, seed=9)
     batch.set("priority_weight", torch.tensor([1.0, 0.0, 1.0]).double().view(3, 1).expand(2, 3, 8))
     value, entries = loss.loss_value(batch)
@@ -145,28 +145,6 @@ def test_target_actions_are_those_of_a_slow_copy_of_the_adapted_policies():
     torch.testing.assert_close(value, expected)
     torch.testing.assert_close(entries["target_value"], plain_entries["target_value"])
     assert entries["target_value"].std() > 0.01
-
-
-def test_the_actors_loss_stores_the_adapted_policies_and_trains_the_meta_policy_only():
-    loss = stack_loss(inner_learning_rate=0.5)
-    batch = transitions(2, TASKS, 8)
-    expected = ordered(loss.adapt(batch[..., :4]))
-    loss.loss_actor(batch)[0].backward()
-    for ours, theirs in zip(ordered(loss.actor_network_params), expected, strict=True):
-        torch.testing.assert_close(ours.detach(), theirs.detach())
-        assert not ours.requires_grad
-        assert ours.grad is None
-    assert all(w.grad is None for w in loss.value_network_params.parameters())
-    assert all(w.grad.abs().sum() > 0 for w in loss.meta_network.parameters())
-
-    learned = [w for w in loss.parameters() if w.requires_grad]
-    meant = [*loss.meta_network.parameters(), *loss.value_network_params.parameters()]
-    assert {id(w) for w in learned} == {id(w) for w in meant}
-    assert len(learned) == 8
-    loss.zero_grad()
-    loss.loss_value(batch)[0].backward()
-    assert all(w.grad.abs().sum() > 0 for w in loss.value_network_params.parameters())
-    assert all(w.grad is None for w in loss.meta_network.parameters())
 
 
 def test_what_does_not_fit_is_refused():

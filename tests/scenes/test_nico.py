@@ -7,12 +7,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import (
-    StepCounter,
-    TransformedEnv,
-    check_env_specs,
-    step_mdp,
-)
+from torchrl.envs import StepCounter, TransformedEnv, check_env_specs, step_mdp
 
 from bgpo_trl.scenes.nico import NicoEnv
 from suites import nico
@@ -78,9 +73,7 @@ def test_each_row_equals_the_environment_of_the_suite(spread):
 
 
 @pytest.mark.parametrize(
-    "duplicate",
-    [deepcopy, lambda env: pickle.loads(pickle.dumps(env))],
-    ids=["deepcopy", "pickle"],
+    "duplicate", [deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deepcopy", "pickle"]
 )
 def test_a_copy_continues_as_the_original(duplicate):
     env = NicoEnv(batch_size=[2], seed=3, observation="both", threads=2)

@@ -18,6 +18,8 @@ from bgpo_trl.transforms import (
     TaskSchedule,
 )
 
+CONCURRENT = TaskSchedule((0, 0, 0))
+
 
 class MockEnv(EnvBase):
     """A row's frames show its seed, task, step and last action, and do not depend on other rows.
@@ -102,22 +104,22 @@ def make_modules(seeds=None):
     return vae, lae, gwr
 
 
-def make_env(seeds=None, lengths=4, max_steps=5, beta=0.1, vae=None, del_keys=False):
-    """The whole composition; `seeds` None is an unbatched environment of seed 0."""
-    _, lae, gwr = make_modules(seeds)
+def make_source(seeds=None, schedule=CONCURRENT):
+    """Demonstrations for an environment; `seeds` None is an unbatched one of seed 0."""
     batch_size = [] if seeds is None else [len(seeds)]
-    source = DemonstrationSource(
-        make_bank(),
-        TaskSchedule((0, 0, 0)),
-        batch_size=batch_size,
-        generator=generators(seeds or [0]),
-    )
+    streams = generators(seeds or [0])
+    return DemonstrationSource(make_bank(), schedule, batch_size=batch_size, generator=streams)
+
+
+def make_env(seeds=None, lengths=4, beta=0.1):
+    """The whole composition; for `seeds`, see `make_source`."""
+    _, lae, gwr = make_modules(seeds)
     return TransformedEnv(
         MockEnv(seeds, lengths),
         Compose(
-            FrameEncoder(vae or TopRow(), del_keys=del_keys),
-            StepCounter(max_steps),
-            source,
+            FrameEncoder(TopRow()),
+            StepCounter(5),
+            make_source(seeds),
             BehaviorLookup(gwr, learn=True),
             BehaviorMatchingReward(lae, beta),
             RewardSum(),

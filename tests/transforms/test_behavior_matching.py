@@ -2,23 +2,18 @@
 
 import pytest
 import torch
-from torchrl.envs import (
-    Compose,
-    RenameTransform,
-    RewardSum,
-    TransformedEnv,
-    check_env_specs,
-)
+from torchrl.envs import Compose, RenameTransform, RewardSum, TransformedEnv, check_env_specs
 
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.transforms import BehaviorMatchingReward, FrameEncoder
 from tests.transforms.environment import MockEnv, make_env, make_modules, play
 
 
-@pytest.mark.parametrize("seeds", [None, [4, 2, 3]])
-def test_the_lstm_state_is_the_embedding_of_the_trajectory_so_far(seeds):
+@pytest.mark.parametrize(("seeds", "beta"), [(None, 0.0), ([4, 2, 3], 0.1)])
+def test_an_episode_ends_with_the_embedding_of_its_trajectory_and_its_reward(seeds, beta):
+    """By hand, at success and at time-out; with a weight of 0, the reward is measured only."""
     lengths = 4 if seeds is None else [2, 4, 9]  # the last one is cut off after 5
-    env = make_env(seeds, lengths)
+    env = make_env(seeds, lengths, beta=beta)
     check_env_specs(env)
     steps, _ = play(env, 20)
     lae = make_modules()[1]
@@ -26,40 +21,21 @@ def test_the_lstm_state_is_the_embedding_of_the_trajectory_so_far(seeds):
     for row, length in rows:
         for start in range(0, 20, length):
             episode = row[start : start + length]
+            after = episode["next"]
             # z_0 ... z_T, the last one included
-            trajectory = torch.cat([episode["latent"][:1], episode["next", "latent"]])
+            trajectory = torch.cat([episode["latent"][:1], after["latent"]])
             phi = lae.encode(trajectory, torch.tensor(length + 1))
-            torch.testing.assert_close(episode["next", "lae_h"][-1], phi)
+            torch.testing.assert_close(after["lae_h"][-1], phi)
             at_start = lae.encode(trajectory[:1], torch.tensor(1))
             torch.testing.assert_close(episode["lae_h"][0], at_start)
 
-
-def test_reward_by_hand_at_success_and_at_time_out():
-    env = make_env([0, 1], lengths=[3, 9], max_steps=5, beta=0.1)
-    steps, _ = play(env, 15)
-    after = steps["next"]
-    for row, length, success in ((0, 3, 1.0), (1, 5, 0.0)):
-        for t in range(15):
-            data = after[row, t]
-            last = (t + 1) % length == 0
-            phi = data["lae_h"]
-            error = sum((b - p) ** 2 for b, p in zip(data["behavior"], phi, strict=True))
-            intrinsic = torch.exp(-(error**0.5)) if last else torch.tensor(0.0)
-            assert data["done"].item() is last
-            assert data["extrinsic_reward"].item() == (success if last else 0.0)
-            torch.testing.assert_close(data["intrinsic_reward"], intrinsic.unsqueeze(0))
-            torch.testing.assert_close(
-                data["reward"], data["extrinsic_reward"] + 0.1 * data["intrinsic_reward"]
-            )
-    assert after["terminated"][1].sum() == 0  # row 1 never succeeds, yet is rewarded
-    assert (after["intrinsic_reward"][1, 4::5] > 1e-4).all()
-
-
-def test_with_beta_zero_the_intrinsic_reward_is_measured_only():
-    plain, weighted = (play(make_env(beta=beta), 8)[0]["next"] for beta in (0.0, 0.5))
-    assert plain["reward"].equal(plain["extrinsic_reward"])
-    assert plain["intrinsic_reward"].equal(weighted["intrinsic_reward"])
-    assert (weighted["reward"] > plain["reward"]).sum() == 2  # the two ends
+            last = torch.arange(length).unsqueeze(-1) == length - 1
+            bonus = last * torch.exp(-(after["behavior"][-1] - phi).square().sum().sqrt())
+            assert after["done"].equal(last)
+            assert after["extrinsic_reward"].equal((last & (length < 5)).float())
+            torch.testing.assert_close(after["intrinsic_reward"], bonus)
+            torch.testing.assert_close(after["reward"], after["extrinsic_reward"] + beta * bonus)
+    assert steps["next", "intrinsic_reward"].max() > 1e-4
 
 
 def test_an_end_is_rewarded_once():

@@ -6,49 +6,26 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.envs import (
-    Compose,
-    SerialEnv,
-    StepCounter,
-    TransformedEnv,
-    check_env_specs,
-)
+from torchrl.envs import Compose, SerialEnv, StepCounter, TransformedEnv, check_env_specs
 
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
-from bgpo_trl.transforms import BehaviorLookup, DemonstrationSource, GroupLookup, TaskSchedule
-from tests.transforms.environment import MockEnv, generators, make_bank, make_modules, play
+from bgpo_trl.transforms import BehaviorLookup, GroupLookup
+from tests.transforms.environment import MockEnv, make_modules, make_source, play
 
 
 def compose(lookup, seeds, lengths):
-    source = DemonstrationSource(
-        make_bank(),
-        TaskSchedule((0, 0, 0)),
-        batch_size=[] if seeds is None else [len(seeds)],
-        generator=generators(seeds or [0]),
-    )
-    return TransformedEnv(MockEnv(seeds, lengths), Compose(StepCounter(50), source, lookup))
+    parts = Compose(StepCounter(50), make_source(seeds), lookup)
+    return TransformedEnv(MockEnv(seeds, lengths), parts)
 
 
-def make(seeds=None, lengths=3, learn=True):
+def make(seeds, lengths):
     gwr = make_modules(seeds)[2]
-    return compose(BehaviorLookup(gwr, learn=learn), seeds, lengths), gwr
+    return compose(BehaviorLookup(gwr, learn=True), seeds, lengths), gwr
 
 
 def make_groups(seeds=None, lengths=3, learn=True):
     groups = [BehaviorGroups(32, smallest=4) for _ in seeds or [0]]
     return compose(GroupLookup(groups, learn=learn), seeds, lengths), groups
-
-
-def snapshot(gwr):
-    indices = range(gwr.batch_size.numel()) if gwr.batch_size else [()]
-    return [[t.clone() for t in gwr.graph(index)] for index in indices]
-
-
-def unchanged(gwr, before):
-    return [
-        all(torch.equal(a, b) for a, b in zip(now, then, strict=True))
-        for now, then in zip(snapshot(gwr), before, strict=True)
-    ]
 
 
 def test_behaviors_are_those_of_algorithm_1():
@@ -68,27 +45,31 @@ def test_behaviors_are_those_of_algorithm_1():
 
 def test_learns_only_from_whole_episodes_and_while_learn_is_set():
     env, gwr = make([0, 1], lengths=4)
-    before = snapshot(gwr)
+    before = gwr.get_extra_state()
+
+    def assert_unchanged():
+        torch.testing.assert_close(gwr.get_extra_state(), before, rtol=0, atol=0)
+
     check_env_specs(env, break_when_any_done="both")
     Collector(env, frames_per_batch=4, total_frames=4).shutdown(close_env=False)
     for _ in range(3):
         env.reset()
-    assert all(unchanged(gwr, before))
+    assert_unchanged()
     env.transform[2].learn = False
     env.train()  # has no influence
     play(env, 12)
-    assert all(unchanged(gwr, before))
+    assert_unchanged()
     env.transform[2].learn = True
     env.eval()  # nor has this
     play(env, 12)
-    assert not any(unchanged(gwr, before))
+    for now, then in zip(gwr.get_extra_state(), before, strict=True):
+        assert not now["weights"].equal(then["weights"])
 
 
 def test_learning_needs_a_step_counter_before_it():
     def make(*transforms, learn=True, base=None):
-        source = DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0)))
         lookup = BehaviorLookup(make_modules()[2], learn=learn)
-        parts = Compose(*transforms, source, lookup)
+        parts = Compose(*transforms, make_source(), lookup)
         return TransformedEnv(base or MockEnv(), parts, auto_unwrap=False), lookup
 
     with pytest.raises(ValueError, match=r"put StepCounter\(50\) before"):
@@ -110,9 +91,8 @@ def test_learning_needs_a_step_counter_before_it():
 
 def test_a_time_limit_within_workers_suffices():
     base = SerialEnv(2, lambda: TransformedEnv(MockEnv(), StepCounter(50)))
-    source = DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0)), batch_size=[2])
     lookup = BehaviorLookup(make_modules([0, 1])[2], learn=True)
-    assert "behavior" in TransformedEnv(base, Compose(source, lookup)).reset()
+    assert "behavior" in TransformedEnv(base, Compose(make_source([0, 1]), lookup)).reset()
 
 
 # ---- groups
@@ -132,44 +112,27 @@ def look_up(groups, phi):
     return torch.stack([m.group for m in matches]), torch.stack([m.novelty for m in matches])
 
 
-@pytest.mark.parametrize("seeds", [None, [4, 2, 3]])
-@pytest.mark.parametrize("learn", [True, False])
-def test_the_group_is_set_at_reset_and_constant_in_the_episode(seeds, learn):
-    env, groups = make_groups(seeds, learn=False)
+@pytest.mark.parametrize(("seeds", "lengths"), [(None, 3), ([4, 2, 3], [2, 3, 5])])
+def test_a_group_is_that_of_the_demonstration_and_groups_learn_when_episodes_end(seeds, lengths):
+    """Rows whose episodes end at different times, against groups adapted by hand."""
+    env, groups = make_groups(seeds, lengths, learn=False)
     check_env_specs(env)
-    env.transform[-1].learn = learn
-    adapt(groups, 15)
-    assert all(of_row.revision == 0 for of_row in groups)
-    start = env.reset()
-    assert start["group"].equal(torch.zeros(env.batch_size, dtype=torch.int64))
-    assert start["group_novelty"].isfinite().all()
-    for _ in range(6):
-        group, novelty = look_up(groups, start["demo_embedding"].view(len(groups), 32))
-        assert start["group"].flatten().equal(group)
-        assert start["group_novelty"].flatten().equal(novelty)
-        steps, following = play(env, 3, start.clone())  # one episode
-        for key in ("group", "group_novelty"):
-            for data in (steps, steps["next"]):
-                assert (data[key] == start[key].unsqueeze(-1)).all()
-        start = following
-    assert all((len(of_row.numbers) > 1) == learn for of_row in groups)
-
-
-def test_groups_learn_from_episodes_that_end_only():
-    """Seeds whose episodes end at different times, against groups adapted by hand."""
-    env, groups = make_groups([4, 2, 3], lengths=[2, 3, 5])
+    env.transform[-1].learn = True
     adapt(groups, 15)
     plain = deepcopy(groups)
     state = env.reset()
+    assert not state["group"].any() and state["group_novelty"].isfinite().all()
     for _ in range(30):
         steps, following = play(env, 1, state.clone())
-        ended = steps["next", "done"].flatten()
-        for row in ended.nonzero().flatten().tolist():
-            plain[row].adapt(state["demo_embedding"][row])
-        group, _ = look_up(plain, following["demo_embedding"])
-        assert following["group"][ended].equal(group[ended])
-        assert following["group"][~ended].equal(state["group"][~ended])
-        assert following["group_novelty"][~ended].equal(state["group_novelty"][~ended])
+        ended = steps["next", "done"].view(env.batch_size)
+        phi = state["demo_embedding"].view(len(groups), 32)
+        for row in ended.flatten().nonzero().flatten().tolist():
+            plain[row].adapt(phi[row])
+        found = look_up(plain, following["demo_embedding"].view(len(groups), 32))
+        for key, expected in zip(("group", "group_novelty"), found, strict=True):
+            assert steps["next", key][..., -1].equal(state[key])  # constant in the episode
+            expected = torch.where(ended, expected.view(env.batch_size), state[key])
+            assert following[key].equal(expected)
         state = following
     for ours, theirs in zip(groups, plain, strict=True):
         assert str(ours.state_dict()) == str(theirs.state_dict())

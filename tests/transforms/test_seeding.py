@@ -8,11 +8,7 @@ from torchrl.envs import Compose, SerialEnv, StepCounter, TransformedEnv
 
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.scenes.nico import NicoEnv
-from bgpo_trl.transforms import (
-    BehaviorLookup,
-    DemonstrationSource,
-    TaskSchedule,
-)
+from bgpo_trl.transforms import BehaviorLookup, DemonstrationSource, TaskSchedule
 from tests.transforms.environment import make_bank
 
 DRAWN = ("state", "demo_index", "behavior")  # by simulation, DemonstrationSource and GWR-B

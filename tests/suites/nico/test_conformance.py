@@ -27,10 +27,6 @@ def test_observations_and_actions_have_the_specs_of_the_paper(load):
     assert (specs["privileged_state"].shape, specs["privileged_state"].dtype) == ((16,), np.float64)
     assert (action.shape, action.dtype) == ((4,), np.float64)
     assert (action.minimum.tolist(), action.maximum.tolist()) == ([-1.0] * 4, [1.0] * 4)
-    for timestep in (env.reset(), *map(env.step, random_actions(3))):
-        assert timestep.observation.keys() == specs.keys()
-        for key, value in timestep.observation.items():
-            specs[key].validate(value)
 
 
 def test_state_is_joints_grip_and_objects(load):
