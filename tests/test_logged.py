@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.logged import replay_logged
 from bgpo_trl.modules.group_trials import GroupTrials
 from bgpo_trl.scenes.nico import NICO
-from tests.helpers import interrupt, rows
+from tests.helpers import finish, interrupt, rows
 from tests.scenes.dot import scene as dot_scene
 from tests.test_training import assert_same_run
 
@@ -147,8 +148,7 @@ def test_a_run_learns_from_the_log_before_its_own_episodes(begin, logged_config,
         known = (batch["action"][0, 0, :, None] == logged).all(-1).any(-1)
         assert known.tolist() == [True] * 6 + [False] * 2
         assert (batch["priority_weight"] == 1).all()
-    with begin(tmp_path / "run", config, resume=True) as trainer:
-        trainer.run()
+    finish(begin(tmp_path / "run", config, resume=True))
     train = rows(tmp_path / "run" / "train.csv")
     assert [int(row["episode"]) for row in train] == [*range(1, config.episodes + 1)]
     assert int(train[0]["env_steps"]) == int(train[0]["steps"])
@@ -159,8 +159,7 @@ def test_an_interrupted_run_equals_one_that_is_not(
     begin, logged_config, log, tmp_path, monkeypatch, offline_updates
 ):
     config = logged_config(offline_updates=offline_updates)
-    with begin(tmp_path / "straight", config, logged=log) as trainer:
-        trainer.run()
+    finish(begin(tmp_path / "straight", config, logged=log))
     run = tmp_path / "run"
     with begin(run, config, logged=log) as trainer:
         store, counts = trainer.algorithm.store_logged, iter(range(N_STEPS))
@@ -173,11 +172,9 @@ def test_an_interrupted_run_equals_one_that_is_not(
         monkeypatch.setattr(trainer.algorithm, "store_logged", stop)
         with pytest.raises(KeyboardInterrupt):
             trainer.run()
-    with begin(run, config, logged=log, resume=True) as trainer:
-        interrupt(trainer, N_STEPS + 5)
+    interrupt(begin(run, config, logged=log, resume=True), N_STEPS + 5)
     shutil.rmtree(log)  # learned before the first checkpoint
-    with begin(run, config, resume=True) as trainer:
-        trainer.run()
+    finish(begin(run, config, resume=True))
     assert_same_run(run, tmp_path / "straight")
     assert len(json.loads((run / "config.json").read_text())["logged"]) == 64
 
@@ -186,8 +183,8 @@ def test_seeds_alone_equal_seeds_of_a_batch(begin, logged_config, log, tmp_path)
     made = []
     for seeds in ((3, 8), (8,)):
         config = logged_config(seeds=seeds, offline_updates=3)
-        with begin(tmp_path / f"{len(seeds)}", config, logged=log) as trainer:
-            interrupt(trainer, N_STEPS + 1)
+        trainer = begin(tmp_path / f"{len(seeds)}", config, logged=log)
+        interrupt(trainer, N_STEPS + 1)
         made.append(trainer.algorithm)
     both, alone = made
     for ours, theirs in zip(both.replay.contents(1), alone.replay.contents(0), strict=True):
@@ -245,7 +242,6 @@ def of_ground_truth(path, config):
         (of_task(LATER), f"episodes of ['{LATER}']", "task_starts"),
         (without_success, "does not say which episodes succeeded", "write_logged_episodes"),
         (too_long, "7 steps", "raise max_steps"),
-        (with_algorithm(replay_size=16, batch_size=8), "", ""),
         (with_algorithm(replay_size=8, batch_size=8), "12 steps, the replay holds 8", "raise"),
         (with_algorithm(proposals="clone"), "learns from demonstrations alone", "leave them out"),
         (of_ground_truth, "no ['state']", "choose an algorithm"),
@@ -255,11 +251,7 @@ def test_a_log_that_does_not_fit_is_refused(
     begin, logged_config, tmp_path, refused, write, cause, remedy
 ):
     config = write(tmp_path / "log", logged_config())
-    if not cause:
-        begin(tmp_path / "run", config, logged=tmp_path / "log").close()
-    else:
-        call = lambda: begin(tmp_path / "run", config, logged=tmp_path / "log")  # noqa: E731
-        refused(call, cause, remedy)
+    refused(partial(begin, tmp_path / "run", config, logged=tmp_path / "log"), cause, remedy)
 
 
 @pytest.mark.parametrize(
@@ -275,8 +267,8 @@ def test_episodes_that_are_not_logged_as_they_should_be_are_not_written(
     tmp_path, refused, changes, cause
 ):
     log = {GRASP: [{**episode(2, success=True), **changes}]}
-    call = lambda: write_logged_episodes(tmp_path / "log", log, scene="nico")  # noqa: E731
-    refused(call, f"episode 0 of {GRASP!r}", cause)
+    write = partial(write_logged_episodes, tmp_path / "log", log, scene="nico")
+    refused(write, f"episode 0 of {GRASP!r}", cause)
 
 
 def test_actions_that_are_nan_in_the_file_are_refused(logged_config, log):
@@ -295,12 +287,11 @@ def test_logged_episodes_are_no_demonstrations(log, refused):
 
 def test_other_logs_are_refused_when_a_run_is_resumed(begin, logged_config, log, tmp_path, refused):
     run, other = tmp_path / "run", tmp_path / "other"
-    with begin(run, logged_config(), logged=log) as trainer:
-        interrupt(trainer, N_STEPS + 2)
+    interrupt(begin(run, logged_config(), logged=log), N_STEPS + 2)
     write_logged_episodes(other, {GRASP: LOG[GRASP]}, scene="nico")
-    again = lambda: begin(run, logged_config(), logged=other, resume=True)  # noqa: E731
-    refused(again, "logged is ", "choose another")
+    again = partial(begin, run, logged_config(), resume=True)
+    refused(partial(again, logged=other), "logged is ", "choose another")
     shutil.rmtree(run / "checkpoint")
     for name in ("train.csv", "eval.csv"):
         (run / name).unlink()
-    refused(lambda: begin(run, logged_config(), resume=True), "logged is ", "choose another")
+    refused(again, "logged is ", "choose another")

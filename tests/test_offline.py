@@ -10,7 +10,7 @@ from bgpo_trl.algorithms import entry
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.training import Trainer
 from tests.algorithms.playing import assert_same
-from tests.helpers import interrupt, rows
+from tests.helpers import finish, interrupt, rows
 from tests.test_training import assert_same_run
 
 pytestmark = pytest.mark.usefixtures("easy_world")
@@ -103,8 +103,7 @@ def test_seeds_learn_alone_what_they_learn_beside_others(
 
 
 def test_an_interrupted_run_equals_one_that_is_not(begin, offline_config, tmp_path, monkeypatch):
-    with begin(tmp_path / "straight", offline_config()) as trainer:
-        trainer.run()
+    finish(begin(tmp_path / "straight", offline_config()))
     run = tmp_path / "run"
     with begin(run, offline_config()) as trainer:
         learn = trainer.algorithm.learner.learn
@@ -118,10 +117,8 @@ def test_an_interrupted_run_equals_one_that_is_not(begin, offline_config, tmp_pa
         monkeypatch.setattr(trainer.algorithm.learner, "learn", stop)
         with pytest.raises(KeyboardInterrupt):
             trainer.run()
-    with begin(run, offline_config(), resume=True) as trainer:
-        interrupt(trainer, 5)
-    with begin(run, offline_config(), resume=True) as trainer:
-        trainer.run()
+    interrupt(begin(run, offline_config(), resume=True), 5)
+    finish(begin(run, offline_config(), resume=True))
     assert_same_run(run, tmp_path / "straight")
     first = rows(run / "train.csv")[0]
     assert float(first["loss_value"]) > 0

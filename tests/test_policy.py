@@ -21,7 +21,7 @@ from bgpo_trl.encoders.representation import save_representation
 from bgpo_trl.scenes.nico import NICO
 from bgpo_trl.training import Trainer
 from suites import nico
-from tests.helpers import edit
+from tests.helpers import edit, finish
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 ROOT = Path(__file__).parents[1]
@@ -342,8 +342,7 @@ def test_a_run_on_the_ground_truth_watches_nothing(
 ):
     place = "bgpo_trl.runs.demonstrations.load_representation"
     monkeypatch.setattr(place, lambda path: encoders)
-    with begin(tmp_path / "run", make_config("state", "ddpg", episodes=1)) as trainer:
-        trainer.run()
+    finish(begin(tmp_path / "run", make_config("state", "ddpg", episodes=1)))
     with pytest.raises(ValueError, match="learned from the ground truth"):
         bgpo_trl.load_run(tmp_path / "run")
 

@@ -11,7 +11,7 @@ from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.runs.directory import load_last, open_tables
 from bgpo_trl.scenes import SCENES, find_scene
 from tests.algorithms.playing import assert_same
-from tests.helpers import CHECKPOINTS, UNPICKLED, edit, interrupt, put_checkpoint, rows
+from tests.helpers import CHECKPOINTS, UNPICKLED, edit, finish, interrupt, put_checkpoint, rows
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 
@@ -20,8 +20,7 @@ pytestmark = pytest.mark.usefixtures("easy_world")
 def interrupted(easy_world, begin, tmp_path_factory):
     """A run that was interrupted half-way, with rows after its last checkpoint."""
     directory = tmp_path_factory.mktemp("interrupted") / "run"
-    with begin(directory) as trainer:
-        interrupt(trainer, 25)
+    interrupt(begin(directory), 25)
     for name in ("train.csv", "eval.csv"):
         with (directory / name).open("a") as file:
             file.write("bgpo,3,9,9,grasp_glass,1,1.0,5\n" * 2)
@@ -83,8 +82,7 @@ def test_a_run_is_resumed_in_the_version_of_its_scene_alone(
     """Nothing else would tell: no encoders, and demonstrations of any scene."""
     run = tmp_path / "run"
     resume = partial(begin, run, make_config("state", "ddpg"), encoders=None, resume=True)
-    with resume() as trainer:
-        interrupt(trainer, 5)
+    interrupt(resume(), 5)
     found = find_scene("nico")
     assert json.loads((run / "config.json").read_text())["scene_version"] == found.version
     for changed in (replace(found, version="2"), replace(found, setup={"camera": "left"})):
@@ -125,18 +123,14 @@ def test_a_run_extended_in_steps_equals_a_longer_run(begin, make_config, tmp_pat
     """Seeds that were done early have gone on, and nothing of that is lost."""
     run, straight = tmp_path / "longer", tmp_path / "straight"
     config = make_config(episodes=16)
-    with begin(straight, config) as trainer:
-        trainer.run()
+    finish(begin(straight, config))
     for episodes in (12, 13):
-        with begin(run, replace(config, episodes=episodes), resume=True) as trainer:
-            trainer.run()
+        finish(begin(run, replace(config, episodes=episodes), resume=True))
         played = sorted((row["seed"], int(row["episode"])) for row in rows(run / "train.csv"))
         assert played == [(seed, n + 1) for seed in "38" for n in range(episodes)]
         assert load_checkpoint(run / "checkpoint")["later"]
-    with begin(run, config, resume=True) as trainer:
-        interrupt(trainer, 1)
-    with begin(run, config, resume=True) as trainer:
-        trainer.run()
+    interrupt(begin(run, config, resume=True), 1)
+    finish(begin(run, config, resume=True))
     for file in ("train.csv", "eval.csv"):
         # Episodes that were played early are logged late.
         lines = [sorted((folder / file).read_text().splitlines()) for folder in (run, straight)]

@@ -17,7 +17,7 @@ from bgpo_trl.runs.results import read_table
 from bgpo_trl.scenes.nico import NicoEnv
 from suites import nico
 from suites.nico.rendering import FrameRenderer
-from tests.helpers import cells
+from tests.helpers import cells, finish
 
 GLASS_Y = 8  # of the state
 VIEWS = ["seen", "places hidden", "objects hidden"]
@@ -180,8 +180,7 @@ def test_the_command_tests_every_seed_in_every_condition(run_of, tmp_path):
 
 def test_a_run_without_encoders_is_refused(begin, make_config, shipped, tmp_path, refused):
     run = tmp_path / "run"
-    with begin(run, make_config("state", "oracle", episodes=4), encoders=None) as trainer:
-        trainer.run()
+    finish(begin(run, make_config("state", "oracle", episodes=4), encoders=None))
     arguments = TrainedArguments(run=run, episodes=1)
     refused(lambda: looking.looking(arguments), "was trained without encoders", "give its Trainer")
 
