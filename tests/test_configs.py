@@ -55,6 +55,7 @@ BAD = {
     },
     BGPOConfig: {
         "state_limit": 0.0,
+        "group_balanced_replay": False,
         "group_size": 3,
         "group_evidence": 0.0,
         "rest_after": 0,
@@ -92,10 +93,7 @@ def test_a_bad_value_is_refused_with_the_name_of_its_field(refused, config, name
 
 @pytest.mark.parametrize(
     ("name", "values"),
-    [
-        ("task_starts", [(), (0, -1, 300), (0, 0.5, 1), (0, 1)]),
-        ("seeds", [(), (1, 1), (-1,)]),
-    ],
+    [("task_starts", [(), (0, -1, 300), (0, 0.5, 1), (0, 1)]), ("seeds", [(), (1, 1), (-1,)])],
 )
 def test_starts_are_whole_numbers_from_0_one_for_each_task_and_seeds_differ(name, values):
     for value in values:
@@ -128,12 +126,10 @@ def test_a_value_of_another_type_is_refused(wrong):
         RunConfig(**wrong)
 
 
-def test_experts_and_demonstrations_restrict_other_settings():
+def test_seeds_learn_from_demonstrations_after_an_episode_of_their_own():
     with pytest.raises(ValueError, match=r"warmup_steps \(49\) must be at least max_steps"):
         BGPOConfig(rl=RLConfig(warmup_steps=49))
     BGPOConfig(rl=RLConfig(warmup_steps=49), experts=False, demonstration_share=0.0)
-    with pytest.raises(ValueError, match="group_balanced_replay must be "):
-        BGPOConfig(group_balanced_replay=False)
 
 
 @pytest.mark.parametrize(

@@ -349,7 +349,7 @@ def test_a_run_on_the_ground_truth_watches_nothing(
 
 @pytest.mark.parametrize("seed", [4, "3"])
 def test_a_seed_that_is_not_in_the_run_is_refused(load, seed):
-    with pytest.raises(ValueError, match="has no seed"):
+    with pytest.raises(ValueError, match=f"has no seed {seed!r}: choose one of 3, 8"):
         load(seed=seed)
 
 

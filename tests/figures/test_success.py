@@ -18,11 +18,7 @@ from matplotlib.text import Text
 from bgpo_trl.figures.frames import plot_frame_strips, save_gif
 from bgpo_trl.figures.gwr import plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
-from bgpo_trl.figures.success import (
-    plot_step_curves,
-    plot_success_curves,
-    plot_success_matrices,
-)
+from bgpo_trl.figures.success import plot_step_curves, plot_success_curves, plot_success_matrices
 from bgpo_trl.runs.results import Run
 
 TASKS = ["grasp_glass", "push_green_to_glass", "push_green_to_white"]
