@@ -154,6 +154,20 @@ def interrupt(trainer: Trainer, step: int, number: int = signal.SIGINT) -> None:
         trainer.run()
 
 
+def interrupt_call(trainer: Trainer, owner: object, name: str, n: int) -> None:
+    """Run until the n-th call of a method, in place of which there is an interrupt; close."""
+    method, calls = getattr(owner, name), itertools.count(1)
+
+    def stop(*arguments: Any) -> Any:
+        if next(calls) == n:
+            raise KeyboardInterrupt
+        return method(*arguments)
+
+    with pytest.MonkeyPatch.context() as patch, trainer, pytest.raises(KeyboardInterrupt):
+        patch.setattr(owner, name, stop)
+        trainer.run()
+
+
 class Recorder(Logger):
     """Logger that keeps what it gets, in place of a service.
 

@@ -118,7 +118,8 @@ task_starts: [0, 300]  # the second task from episode 301
 episodes: 600
 spread: 1  # a whole number for a share
 algorithm:
-  beta: 0.2
+  <<: {beta: 0.5, max_steps: 50}
+  beta: 0.2  # in place of the one that is merged
   rl: {learning_rate: 3e-4}
 """
 
@@ -174,17 +175,3 @@ def test_a_wrong_file_of_encoder_settings_is_refused(tmp_path, refused):
     refused(read, "unknown setting vae.stepps", str(path))
     path.write_text("vae: {steps: 0}")
     refused(read, "vae: steps must be at least 1", str(path))
-
-
-def test_a_key_may_stand_again_in_another_mapping_and_beside_one_that_is_merged(tmp_path):
-    path = tmp_path / "mine.yaml"
-    path.write_text(
-        "name: bgpo-single\n"
-        "algorithm:\n"
-        "  <<: {beta: 0.5, max_steps: 9}\n"
-        "  beta: 0.25\n"
-        "  gwr: {max_age: 7}\n"
-        "  rl: {gamma: 0.9}\n"
-    )
-    algorithm = run_config(Arguments(config=path)).algorithm
-    assert (algorithm.beta, algorithm.max_steps, algorithm.rl.gamma) == (0.25, 9, 0.9)

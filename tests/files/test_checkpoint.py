@@ -83,15 +83,6 @@ def test_a_damaged_checkpoint_is_skipped_with_a_warning_or_read_as_it_was(
         assert load_checkpoint(directory)["episode"] == 3
 
 
-@pytest.mark.filterwarnings("ignore:.*damaged:UserWarning")
-def test_without_an_intact_checkpoint_loading_is_refused(tmp_path):
-    for episode in range(2):
-        save_checkpoint(tmp_path / "damaged", {"episode": episode}).write_bytes(b"")
-    for name in ("damaged", "nowhere"):
-        with pytest.raises(ValueError, match=r"^[^\n]*no intact checkpoint[^\n]*a new run[^\n]*$"):
-            load_checkpoint(tmp_path / name)
-
-
 @settings(max_examples=15)
 @given(room=st.floats(0, 1, exclude_max=True))
 def test_a_full_disk_keeps_earlier_checkpoints(room, tmp_path_factory):

@@ -69,25 +69,6 @@ def test_a_partial_last_row_is_dropped(tmp_path):
         assert path.read_bytes() == HEAD + rows + b"3,,\n", cut
 
 
-@pytest.mark.parametrize("kept", range(4))
-def test_a_truncated_and_continued_file_equals_an_uninterrupted_one(kept, tmp_path):
-    rows = [{"episode": episode, "return": 0.1**episode} for episode in range(3)]
-    with CsvFile(tmp_path / "straight.csv", COLUMNS) as straight:
-        for row in rows:
-            straight.write(row)
-    interrupted = CsvFile(tmp_path / "resumed.csv", COLUMNS)
-    for row in rows[:kept]:
-        interrupted.write(row)
-    position = interrupted.position()
-    for row in rows[kept:]:
-        interrupted.write({**row, "task": "lost"})
-    with CsvFile(tmp_path / "resumed.csv", COLUMNS) as resumed:
-        resumed.truncate_to(position)
-        for row in rows[kept:]:
-            resumed.write(row)
-    assert (tmp_path / "resumed.csv").read_bytes() == (tmp_path / "straight.csv").read_bytes()
-
-
 def test_truncation_within_a_row_is_refused(tmp_path):
     path = tmp_path / "eval.csv"
     with CsvFile(path, COLUMNS) as file:

@@ -8,7 +8,7 @@ from functools import partial
 import pytest
 
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
-from bgpo_trl.runs.directory import load_last, open_tables
+from bgpo_trl.runs.directory import open_tables
 from bgpo_trl.scenes import SCENES, find_scene
 from tests.algorithms.playing import assert_same
 from tests.helpers import CHECKPOINTS, UNPICKLED, edit, finish, interrupt, put_checkpoint, rows
@@ -137,23 +137,6 @@ def test_a_run_extended_in_steps_equals_a_longer_run(begin, make_config, tmp_pat
         assert lines[0] == lines[1]
     assert (run / "config.json").read_text() == (straight / "config.json").read_text()
     assert_same(*(load_checkpoint(folder / "checkpoint") for folder in (run, straight)))
-
-    with pytest.raises(ValueError, match="episodes is 16 there and 13 here"):
-        begin(run, replace(config, episodes=13), resume=True)
-
-
-def test_only_the_number_of_episodes_may_grow(begin, make_config, tmp_path):
-    with begin(tmp_path):
-        pass
-    settings = json.loads((tmp_path / "config.json").read_text())
-    for longer in (settings, {**settings, "episodes": 11}):
-        assert load_last(tmp_path, longer) is None
-    for name in ("seeds", "encoders", "name", "algorithm"):
-        with pytest.raises(ValueError, match=rf"\({name}.* is .* there and other here"):
-            load_last(tmp_path, {**settings, name: "other"})
-    for episodes in (9, "11", True):
-        with pytest.raises(ValueError, match="episodes is 10 there and"):
-            load_last(tmp_path, {**settings, "episodes": episodes})
 
 
 def test_a_column_that_is_there_already_is_refused(tmp_path):
