@@ -23,16 +23,10 @@ NEW = "lift_green"
 @pytest.fixture(scope="module")
 def further(bank, encoders, tmp_path_factory):
     """A file with demonstrations of a fourth task, which lie apart from the others."""
-    shown, path = bank.of_task(2), tmp_path_factory.mktemp("further") / "bank.safetensors"
-    added = replace(
-        shown,
-        embedding=shown.embedding - 4.0,
-        task=torch.zeros_like(shown.task),
-        tasks=(NEW,),
-        encoder_id=encoders.identity,
-        scene=encoders.metadata["scene"],
-    )
-    added.save(path)
+    path = tmp_path_factory.mktemp("further") / "bank.safetensors"
+    shown = replace(bank.for_tasks(bank.tasks[2:]), tasks=(NEW,), encoder_id=encoders.identity)
+    shown = replace(shown, embedding=shown.embedding - 4.0, scene=encoders.metadata["scene"])
+    shown.save(path)
     return path
 
 

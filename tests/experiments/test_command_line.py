@@ -63,6 +63,8 @@ CASES = [
     ("bgpo continual --import juggling", "--import juggling"),
     ("bgpo continual --bank file", "file is damaged or not a bank"),
     ("bgpo continual --bank new --train-encoders", "--bank"),
+    ("bgpo continual --add-task lift_green", "--add-task: name a run with --resume and --out"),
+    ("bgpo concurrent --add-task lift_green", "is for `bgpo continual`"),
     # where results go
     ("continual.py --out file/run", "cannot make the folder file/run"),
     ("bgpo continual --preset quick --out run --resume", "algorithm holds no settings"),

@@ -23,8 +23,7 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize(
-    ("torch", "fits"),
-    [("2.13.0", True), ("2.14.1+cu128", True), ("2.12.9", False), ("3.0", False)],
+    ("torch", "fits"), [("2.13.0", True), ("2.14.1+cu128", True), ("2.12.9", False), ("3.0", False)]
 )
 def test_all_that_is_missing_or_does_not_fit_is_installed_by_one_line(monkeypatch, torch, fits):
     """Extras are not required."""

@@ -150,7 +150,6 @@ def test_yaml_json_and_flags_store_the_same_settings(tmp_path):
     [
         ("mine.yaml", "seeds: [0, 1\nepisodes: 5", "line 2"),
         ("mine.yaml", "- seeds", "name: value"),
-        ("mine.yaml", "episods: 5", "unknown setting episods"),
         ("mine.yaml", "tasks: &all [*all]", "unhashable"),
         ("mine.yaml", "seeds: !!python/tuple [1]", "line 1"),
         ("mine.yaml", "seeds: [0]\nname: x\nseeds: [1]", "line 3 cannot be read ('seeds' is given"),

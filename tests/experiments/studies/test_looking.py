@@ -17,7 +17,7 @@ from bgpo_trl.runs.results import read_table
 from bgpo_trl.scenes.nico import NicoEnv
 from suites import nico
 from suites.nico.rendering import FrameRenderer
-from tests.helpers import cells, finish
+from tests.helpers import cells
 
 GLASS_Y = 8  # of the state
 VIEWS = ["seen", "places hidden", "objects hidden"]
@@ -176,13 +176,6 @@ def test_the_command_tests_every_seed_in_every_condition(run_of, tmp_path):
     head, *lines = cells(printed)
     assert head == ["success, %", *CONDITIONS]
     assert [row[0] for row in lines] == [*nico.PAPER_TASKS, "all"]
-
-
-def test_a_run_without_encoders_is_refused(begin, make_config, shipped, tmp_path, refused):
-    run = tmp_path / "run"
-    finish(begin(run, make_config("state", "oracle", episodes=4), encoders=None))
-    arguments = TrainedArguments(run=run, episodes=1)
-    refused(lambda: looking.looking(arguments), "was trained without encoders", "give its Trainer")
 
 
 def test_a_merged_run_is_tested_by_its_blocks(run_of):
