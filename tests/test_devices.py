@@ -20,7 +20,6 @@ from bgpo_trl.training import Trainer
 from tests.helpers import TINY_ENCODERS, rows
 from tests.second_device import second_device
 
-ALGORITHMS = ("bgpo",)
 # The first two need data of each task; the last rests after a boundary, with an empty replay.
 LONGER = ("maml-demonstrations", "dist-nll-demonstrations", "ewc")
 
@@ -50,7 +49,7 @@ def test_colors_are_doubted_wherever_the_network_is(device, encoders):
 
 
 @pytest.mark.usefixtures("easy_world")
-@pytest.mark.parametrize("name", [*ALGORITHMS, *LONGER])
+@pytest.mark.parametrize("name", ["bgpo", *LONGER])
 def test_a_run_is_the_same_on_every_device(device, name, bank, encoders, make_config, tmp_path):
     config = make_config(name=name, episodes=16 if name in LONGER else 6, eval_every=3)
     parts = {"bank": bank, "encoders": encoders, "progress": False}

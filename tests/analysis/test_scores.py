@@ -64,10 +64,10 @@ def test_own_episodes_by_task_and_seed(tmp_path):
     never, early = [0] * 30, [1] * 10 + [0] * 10  # of fewer than twenty there is no rate
     directory = write_run(tmp_path, "bgpo", 9, episodes=120)
     assert scores.own_episodes(read_run(directory)) is None
-    seeds = [[learned(20), learned(30), never], [learned(40), learned(40), learned(30)]]
-    write_training(directory, [*seeds, [[1] * 19, early, [0] * 10 + [1] * 20]])
+    seeds = [[learned(20), learned(30), never], [learned(40), [1] * 19, learned(30)]]
+    write_training(directory, [*seeds, [[], early, [0] * 10 + [1] * 20]])
     run = read_run(directory)
-    assert scores.own_episodes(run).tolist() == [[20, 30, INF], [40, 40, 30], [INF, 20, 20]]
+    assert scores.own_episodes(run).tolist() == [[20, 30, INF], [40, INF, 30], [INF, 20, 20]]
     assert scores.own_episodes(run, 0.8)[2].tolist() == [INF, INF, 26]
 
 

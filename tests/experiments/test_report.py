@@ -9,9 +9,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis import statistics
-from bgpo_trl.analysis.comparison import NAMES, Setting
+from bgpo_trl.analysis.comparison import Setting
 from bgpo_trl.analysis.scores import forward_transfer
 from bgpo_trl.analysis.tables import success_section
 from bgpo_trl.experiments.report import ReportArguments, report
@@ -217,7 +216,3 @@ def test_other_conditions_are_refused_before_anything_is_written(tmp_path, refus
     for archive in (None, tmp_path / "archive"):
         asked = ReportArguments((tmp_path,), archive=archive)
         refused(partial(report, asked), "differ in held_out (validation and test)", "only runs")
-
-
-def test_every_algorithm_has_a_name_in_tables():
-    assert set(NAMES) == set(ALGORITHMS)
