@@ -192,12 +192,11 @@ def restored_registries() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def usual_dpi() -> Iterator[int]:
-    """Save figures with fewer pixels, which is faster; return the usual resolution."""
-    usual = style.DPI
+def few_pixels() -> Iterator[None]:
+    """Save figures with fewer pixels, which is faster."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(style, "DPI", 60)
-        yield usual
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

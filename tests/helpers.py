@@ -140,10 +140,31 @@ def at_step(trainer: Trainer, n: int, do: Callable[[], object]) -> None:
     trainer.algorithm.store = store_after
 
 
+def finish(trainer: Trainer) -> Trainer:
+    """Run to the end and close; return the trainer."""
+    with trainer:
+        trainer.run()
+    return trainer
+
+
 def interrupt(trainer: Trainer, step: int, number: int = signal.SIGINT) -> None:
-    """Run until a signal during a step, which is to end the run after it."""
+    """Run until a signal during a step, which is to end the run after it; close."""
     at_step(trainer, step, lambda: signal.raise_signal(number))
-    with pytest.raises(KeyboardInterrupt):
+    with trainer, pytest.raises(KeyboardInterrupt):
+        trainer.run()
+
+
+def interrupt_call(trainer: Trainer, owner: object, name: str, n: int) -> None:
+    """Run until the n-th call of a method, in place of which there is an interrupt; close."""
+    method, calls = getattr(owner, name), itertools.count(1)
+
+    def stop(*arguments: Any) -> Any:
+        if next(calls) == n:
+            raise KeyboardInterrupt
+        return method(*arguments)
+
+    with pytest.MonkeyPatch.context() as patch, trainer, pytest.raises(KeyboardInterrupt):
+        patch.setattr(owner, name, stop)
         trainer.run()
 
 

@@ -84,7 +84,7 @@ def library(small, encoders, bank, tmp_path_factory):
     )
     directory = tmp_path_factory.mktemp("library")
     with Trainer(run, directory, bank=bank, encoders=encoders, progress=False) as trainer:
-        record(trainer.algorithm, "store", "update")
+        record(trainer.algorithm, "store")
         record(trainer.evaluator, "run")
         trainer.run()
     return trainer
@@ -135,19 +135,10 @@ def test_transitions_are_those_of_the_library(minimal, library, small):
         assert held.equal(ours[key][-len(held) :].view_as(held))
 
 
-def test_losses_of_every_update_are_those_of_the_library(minimal, library):
-    ours = torch.stack([torch.stack(result) for _, result in minimal.calls["update"]])
-    updates = [result for _, result in library.algorithm.calls["update"] if result]
-    theirs = torch.stack(
-        [torch.cat([losses["loss_actor"], losses["loss_value"]]) for losses in updates]
-    )
-    assert len(ours) > 80
-    assert_close(ours, theirs)
-    assert minimal.highest_return == library.algorithm.learner.loss.return_bounds[1]
-
-
 @pytest.mark.parametrize("network", ["actor", "critic", "target_actor", "target_critic"])
 def test_weights_are_those_of_the_library(minimal, library, network):
+    """Hence also the losses of all updates."""
+    assert len(minimal.calls["update"]) > 80
     name = network.replace("actor", "actor_network").replace("critic", "value_network")
     theirs = library.algorithm.learner.loss.get_submodule(f"{name}_params")
     theirs = dict(theirs.flatten_keys(".").items())

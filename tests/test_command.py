@@ -1,13 +1,11 @@
 """The command ``bgpo``: its list of sub-commands, and how each is called."""
 
-import importlib.metadata
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-import bgpo_trl
 from bgpo_trl import __main__ as command
 from bgpo_trl.experiments.watch import WatchArguments
 
@@ -30,10 +28,6 @@ assert used.ru_utime + used.ru_stime < 3
 def call(monkeypatch, *options):
     monkeypatch.setattr(sys, "argv", ["bgpo", *options])
     command.main()
-
-
-def test_the_version_is_that_of_the_distribution():
-    assert bgpo_trl.__version__ == importlib.metadata.version("bgpo_trl")
 
 
 def test_help_lists_every_command(monkeypatch, capsys):

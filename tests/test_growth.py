@@ -13,7 +13,7 @@ from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.growth import add_task, distinctness
 from bgpo_trl.training import Trainer
-from tests.helpers import interrupt, rows
+from tests.helpers import finish, interrupt, rows
 from tests.test_training import assert_same, assert_same_run
 
 pytestmark = pytest.mark.usefixtures("easy_world")
@@ -23,16 +23,10 @@ NEW = "lift_green"
 @pytest.fixture(scope="module")
 def further(bank, encoders, tmp_path_factory):
     """A file with demonstrations of a fourth task, which lie apart from the others."""
-    shown, path = bank.of_task(2), tmp_path_factory.mktemp("further") / "bank.safetensors"
-    added = replace(
-        shown,
-        embedding=shown.embedding - 4.0,
-        task=torch.zeros_like(shown.task),
-        tasks=(NEW,),
-        encoder_id=encoders.identity,
-        scene=encoders.metadata["scene"],
-    )
-    added.save(path)
+    path = tmp_path_factory.mktemp("further") / "bank.safetensors"
+    shown = replace(bank.for_tasks(bank.tasks[2:]), tasks=(NEW,), encoder_id=encoders.identity)
+    shown = replace(shown, embedding=shown.embedding - 4.0, scene=encoders.metadata["scene"])
+    shown.save(path)
     return path
 
 
@@ -40,8 +34,7 @@ def further(bank, encoders, tmp_path_factory):
 def three(begin, make_config, tmp_path_factory):
     """A finished run of three tasks, whose seeds are not in step."""
     directory = tmp_path_factory.mktemp("three")
-    with begin(directory, make_config(eval_every=3)) as trainer:
-        trainer.run()
+    finish(begin(directory, make_config(eval_every=3)))
     return directory
 
 
@@ -77,8 +70,7 @@ def test_nothing_that_was_learned_changes_when_a_task_is_added(grow, three):
 
 def test_the_added_task_is_played_and_tested_from_its_start_and_rows_before_stay(grow, three):
     run, grown = grow("run")
-    with resumed(run, grown) as trainer:
-        trainer.run()
+    finish(resumed(run, grown))
     start = grown.config.task_starts[-1]
     played = [int(row["episode"]) for row in rows(run / "train.csv") if row["task"] == NEW]
     tested = {int(row["episode"]) for row in rows(run / "eval.csv") if row["task"] == NEW}
@@ -91,17 +83,14 @@ def test_the_added_task_is_played_and_tested_from_its_start_and_rows_before_stay
 
 def test_a_run_that_is_interrupted_after_the_addition_equals_one_that_is_not(grow, encoders):
     straight, grown = grow("straight")
-    with resumed(straight, grown) as trainer:
-        trainer.run()
+    finish(resumed(straight, grown))
     run, grown = grow("interrupted")
     resumed(run, grown).close()  # as if killed before its first checkpoint
     config = read_config(run / "config.json")[0]
     for step in (3, 20):
-        with resumed(run, grown._replace(config=config)) as trainer:
-            interrupt(trainer, step)
+        interrupt(resumed(run, grown._replace(config=config)), step)
     bank = DemonstrationBank.load(run / "bank.safetensors", encoder_id=encoders.identity)
-    with resumed(run, grown, bank=bank) as trainer:
-        trainer.run()
+    finish(resumed(run, grown, bank=bank))
     assert_same_run(run, straight)
 
 
@@ -125,8 +114,7 @@ def test_algorithms_with_a_fixed_number_of_tasks_take_no_further_one(
     begin, make_config, further, tmp_path, refused, name
 ):
     run = tmp_path / "run"
-    with begin(run, make_config(name=name, episodes=5)) as trainer:
-        trainer.run()
+    finish(begin(run, make_config(name=name, episodes=5)))
     config = replace(read_config(run / "config.json")[0], episodes=20)
     grown = add_task(run, NEW, config=config, bank=further)
     refused(lambda: resumed(run, grown), "cannot take another one", "new run with all")

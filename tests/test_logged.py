@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.logged import replay_logged
 from bgpo_trl.modules.group_trials import GroupTrials
 from bgpo_trl.scenes.nico import NICO
-from tests.helpers import interrupt, rows
+from tests.helpers import finish, interrupt, interrupt_call, rows
 from tests.scenes.dot import scene as dot_scene
 from tests.test_training import assert_same_run
 
@@ -147,8 +148,7 @@ def test_a_run_learns_from_the_log_before_its_own_episodes(begin, logged_config,
         known = (batch["action"][0, 0, :, None] == logged).all(-1).any(-1)
         assert known.tolist() == [True] * 6 + [False] * 2
         assert (batch["priority_weight"] == 1).all()
-    with begin(tmp_path / "run", config, resume=True) as trainer:
-        trainer.run()
+    finish(begin(tmp_path / "run", config, resume=True))
     train = rows(tmp_path / "run" / "train.csv")
     assert [int(row["episode"]) for row in train] == [*range(1, config.episodes + 1)]
     assert int(train[0]["env_steps"]) == int(train[0]["steps"])
@@ -156,28 +156,16 @@ def test_a_run_learns_from_the_log_before_its_own_episodes(begin, logged_config,
 
 @pytest.mark.parametrize("offline_updates", [0, 3])
 def test_an_interrupted_run_equals_one_that_is_not(
-    begin, logged_config, log, tmp_path, monkeypatch, offline_updates
+    begin, logged_config, log, tmp_path, offline_updates
 ):
     config = logged_config(offline_updates=offline_updates)
-    with begin(tmp_path / "straight", config, logged=log) as trainer:
-        trainer.run()
+    finish(begin(tmp_path / "straight", config, logged=log))
     run = tmp_path / "run"
-    with begin(run, config, logged=log) as trainer:
-        store, counts = trainer.algorithm.store_logged, iter(range(N_STEPS))
-
-        def stop(transition):
-            if next(counts) == 7:
-                raise KeyboardInterrupt
-            store(transition)
-
-        monkeypatch.setattr(trainer.algorithm, "store_logged", stop)
-        with pytest.raises(KeyboardInterrupt):
-            trainer.run()
-    with begin(run, config, logged=log, resume=True) as trainer:
-        interrupt(trainer, N_STEPS + 5)
+    trainer = begin(run, config, logged=log)
+    interrupt_call(trainer, trainer.algorithm, "store_logged", 8)
+    interrupt(begin(run, config, logged=log, resume=True), N_STEPS + 5)
     shutil.rmtree(log)  # learned before the first checkpoint
-    with begin(run, config, resume=True) as trainer:
-        trainer.run()
+    finish(begin(run, config, resume=True))
     assert_same_run(run, tmp_path / "straight")
     assert len(json.loads((run / "config.json").read_text())["logged"]) == 64
 
@@ -186,8 +174,8 @@ def test_seeds_alone_equal_seeds_of_a_batch(begin, logged_config, log, tmp_path)
     made = []
     for seeds in ((3, 8), (8,)):
         config = logged_config(seeds=seeds, offline_updates=3)
-        with begin(tmp_path / f"{len(seeds)}", config, logged=log) as trainer:
-            interrupt(trainer, N_STEPS + 1)
+        trainer = begin(tmp_path / f"{len(seeds)}", config, logged=log)
+        interrupt(trainer, N_STEPS + 1)
         made.append(trainer.algorithm)
     both, alone = made
     for ours, theirs in zip(both.replay.contents(1), alone.replay.contents(0), strict=True):
@@ -197,69 +185,30 @@ def test_seeds_alone_equal_seeds_of_a_batch(begin, logged_config, log, tmp_path)
         torch.testing.assert_close(value, second[key], rtol=0, atol=1e-5)
 
 
-def of_dot(path, config):
-    log = {"left": [episode(2, success=True, shape=(16, 24), size=1)]}
-    write_logged_episodes(path, log, scene=dot_scene())
-    return config
-
-
-def of_task(task):
-    def write(path, config):
-        write_logged_episodes(path, {task: [episode(2, success=True)]}, scene="nico")
-        return config
-
-    return write
-
-
-def without_success(path, config):
-    shown = {key: value for key, value in episode(2, success=True).items() if key != "success"}
-    write_demonstrations(path, {GRASP: [shown]}, scene="nico", held_out_per_task=0)
-    return config
-
-
-def too_long(path, config):
-    write_logged_episodes(path, {GRASP: [episode(7, success=False)]}, scene="nico")
-    return config
-
-
-def with_algorithm(**changes):
-    def write(path, config):
-        write_logged_episodes(path, LOG, scene="nico")
-        rl = replace(config.algorithm.rl, **changes)
-        return replace(config, algorithm=replace(config.algorithm, rl=rl))
-
-    return write
-
-
-def of_ground_truth(path, config):
-    write_logged_episodes(path, LOG, scene="nico")
-    rl = replace(config.algorithm.rl, proposals="actor", imitation=0.0)
-    changes = {"state": "state", "demonstration_share": 0.0, "rl": rl}
-    return replace(config, algorithm=replace(config.algorithm, **changes))
+GROUND_TRUTH = {"state": "state", "demonstration_share": 0.0}
+GROUND_TRUTH |= {"rl": {"proposals": "actor", "imitation": 0.0}}
+DOT = {"left": [episode(2, success=True, shape=(16, 24), size=1)]}
 
 
 @pytest.mark.parametrize(
-    ("write", "cause", "remedy"),
+    ("log", "algorithm", "cause", "remedy"),
     [
-        (of_dot, "is of the scene dot dot-1", "take what is of 'nico'"),
-        (of_task(LATER), f"episodes of ['{LATER}']", "task_starts"),
-        (without_success, "does not say which episodes succeeded", "write_logged_episodes"),
-        (too_long, "7 steps", "raise max_steps"),
-        (with_algorithm(replay_size=16, batch_size=8), "", ""),
-        (with_algorithm(replay_size=8, batch_size=8), "12 steps, the replay holds 8", "raise"),
-        (with_algorithm(proposals="clone"), "learns from demonstrations alone", "leave them out"),
-        (of_ground_truth, "no ['state']", "choose an algorithm"),
+        (DOT, {}, "is of the scene dot dot-1", "take what is of 'nico'"),
+        ({LATER: LOG[PUSH]}, {}, f"episodes of ['{LATER}']", "task_starts"),
+        ({GRASP: [episode(7, success=False)]}, {}, "7 steps", "raise max_steps"),
+        (LOG, {"rl": {"replay_size": 8, "batch_size": 8}}, "12 steps, the replay holds 8", "raise"),
+        (LOG, {"rl": {"proposals": "clone"}}, "learns from demonstrations alone", "leave them out"),
+        (LOG, GROUND_TRUTH, "no ['state']", "choose an algorithm"),
     ],
 )
 def test_a_log_that_does_not_fit_is_refused(
-    begin, logged_config, tmp_path, refused, write, cause, remedy
+    begin, logged_config, tmp_path, refused, log, algorithm, cause, remedy
 ):
-    config = write(tmp_path / "log", logged_config())
-    if not cause:
-        begin(tmp_path / "run", config, logged=tmp_path / "log").close()
-    else:
-        call = lambda: begin(tmp_path / "run", config, logged=tmp_path / "log")  # noqa: E731
-        refused(call, cause, remedy)
+    config = logged_config()
+    rl = replace(config.algorithm.rl, **algorithm.get("rl", {}))
+    config = replace(config, algorithm=replace(config.algorithm, **{**algorithm, "rl": rl}))
+    write_logged_episodes(tmp_path / "log", log, scene=dot_scene() if log is DOT else "nico")
+    refused(partial(begin, tmp_path / "run", config, logged=tmp_path / "log"), cause, remedy)
 
 
 @pytest.mark.parametrize(
@@ -275,8 +224,8 @@ def test_episodes_that_are_not_logged_as_they_should_be_are_not_written(
     tmp_path, refused, changes, cause
 ):
     log = {GRASP: [{**episode(2, success=True), **changes}]}
-    call = lambda: write_logged_episodes(tmp_path / "log", log, scene="nico")  # noqa: E731
-    refused(call, f"episode 0 of {GRASP!r}", cause)
+    write = partial(write_logged_episodes, tmp_path / "log", log, scene="nico")
+    refused(write, f"episode 0 of {GRASP!r}", cause)
 
 
 def test_actions_that_are_nan_in_the_file_are_refused(logged_config, log):
@@ -289,18 +238,21 @@ def test_actions_that_are_nan_in_the_file_are_refused(logged_config, log):
         broken.check(config, NICO)
 
 
-def test_logged_episodes_are_no_demonstrations(log, refused):
+def test_logged_episodes_are_no_demonstrations_nor_these_a_log(log, tmp_path, refused):
     refused(lambda: load_demonstrations(log), "may have failed", "--logged")
+    shown = {name: LOG[GRASP][0][name] for name in ("pixels", "action")}
+    write_demonstrations(tmp_path / "shown", {GRASP: [shown]}, scene="nico", held_out_per_task=0)
+    load = partial(LoggedEpisodes.load, tmp_path / "shown")
+    refused(load, "does not say which episodes succeeded", "write_logged_episodes")
 
 
 def test_other_logs_are_refused_when_a_run_is_resumed(begin, logged_config, log, tmp_path, refused):
     run, other = tmp_path / "run", tmp_path / "other"
-    with begin(run, logged_config(), logged=log) as trainer:
-        interrupt(trainer, N_STEPS + 2)
+    interrupt(begin(run, logged_config(), logged=log), N_STEPS + 2)
     write_logged_episodes(other, {GRASP: LOG[GRASP]}, scene="nico")
-    again = lambda: begin(run, logged_config(), logged=other, resume=True)  # noqa: E731
-    refused(again, "logged is ", "choose another")
+    again = partial(begin, run, logged_config(), resume=True)
+    refused(partial(again, logged=other), "logged is ", "choose another")
     shutil.rmtree(run / "checkpoint")
     for name in ("train.csv", "eval.csv"):
         (run / name).unlink()
-    refused(lambda: begin(run, logged_config(), resume=True), "logged is ", "choose another")
+    refused(again, "logged is ", "choose another")

@@ -10,7 +10,7 @@ from bgpo_trl.algorithms import entry
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.training import Trainer
 from tests.algorithms.playing import assert_same
-from tests.helpers import interrupt, rows
+from tests.helpers import finish, interrupt, interrupt_call, rows
 from tests.test_training import assert_same_run
 
 pytestmark = pytest.mark.usefixtures("easy_world")
@@ -102,26 +102,13 @@ def test_seeds_learn_alone_what_they_learn_beside_others(
         assert any((value != first[key]).any() for key, value in ours.items())
 
 
-def test_an_interrupted_run_equals_one_that_is_not(begin, offline_config, tmp_path, monkeypatch):
-    with begin(tmp_path / "straight", offline_config()) as trainer:
-        trainer.run()
+def test_an_interrupted_run_equals_one_that_is_not(begin, offline_config, tmp_path):
+    finish(begin(tmp_path / "straight", offline_config()))
     run = tmp_path / "run"
-    with begin(run, offline_config()) as trainer:
-        learn = trainer.algorithm.learner.learn
-        counts = iter(range(N))
-
-        def stop(batch):
-            if next(counts) == N // 2:
-                raise KeyboardInterrupt
-            return learn(batch)
-
-        monkeypatch.setattr(trainer.algorithm.learner, "learn", stop)
-        with pytest.raises(KeyboardInterrupt):
-            trainer.run()
-    with begin(run, offline_config(), resume=True) as trainer:
-        interrupt(trainer, 5)
-    with begin(run, offline_config(), resume=True) as trainer:
-        trainer.run()
+    trainer = begin(run, offline_config())
+    interrupt_call(trainer, trainer.algorithm.learner, "learn", N // 2)
+    interrupt(begin(run, offline_config(), resume=True), 5)
+    finish(begin(run, offline_config(), resume=True))
     assert_same_run(run, tmp_path / "straight")
     first = rows(run / "train.csv")[0]
     assert float(first["loss_value"]) > 0

@@ -14,7 +14,7 @@ from bgpo_trl.encoders.representation import load_representation
 from bgpo_trl.encoders.train import train_encoders
 from bgpo_trl.scenes import SCENES, find_scene
 from bgpo_trl.training import Trainer
-from tests.helpers import TINY_ENCODERS
+from tests.helpers import TINY_ENCODERS, finish
 from tests.scenes.dot import SavedDot, scene
 
 TASKS = ("left", "right")
@@ -74,8 +74,7 @@ def test_demonstrations_without_actions_train_encoders_and_runs(
     assert bank.tasks == TASKS and len(bank.seen().embedding) == 6
 
     config, run = config_of(make_config, 0.0), tmp_path / "run"
-    with Trainer(config, run, bank=bank, encoders=encoders, progress=False) as trainer:
-        trainer.run()
+    finish(Trainer(config, run, bank=bank, encoders=encoders, progress=False))
 
     assert len((run / "train.csv").read_text().splitlines()) == 1 + 4
     policy = bgpo_trl.load_run(run)
@@ -98,6 +97,5 @@ def test_demonstrations_are_experience_if_they_or_play_have_actions(
     encoders, bank = made(**{source: True})
     assert encoders.inverse is not None and bank.steps is not None
     config, run = config_of(make_config, 0.25), tmp_path / "run"
-    with Trainer(config, run, bank=bank, encoders=encoders, progress=False) as trainer:
-        trainer.run()
-        assert len(trainer.algorithm.shown)
+    trainer = finish(Trainer(config, run, bank=bank, encoders=encoders, progress=False))
+    assert len(trainer.algorithm.shown)

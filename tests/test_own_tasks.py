@@ -14,6 +14,7 @@ from bgpo_trl.evaluation import evaluate_random_policy
 from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.training import Trainer
 from suites import nico
+from tests.helpers import finish
 
 
 class AtOnce(nico.NicoTask):
@@ -85,8 +86,7 @@ def test_a_run_is_resumed_with_its_demonstrations_from_whatever_module(
     parts = {"encoders": None, "resume": True}
     for module in ("my_tasks", "renamed"):
         nico.add_task("at_once", type("Renamed", (AtOnce,), {"__module__": module}))
-        with begin(tmp_path, config, bank=bank_of("at_once"), **parts) as trainer:
-            trainer.run()
+        finish(begin(tmp_path, config, bank=bank_of("at_once"), **parts))
         stored = json.loads((tmp_path / "config.json").read_text())
         assert stored["task_modules"] == {"at_once": module}
     with begin(tmp_path, config, bank=bank_of("at_once") + bank_of("grasp_glass"), **parts):

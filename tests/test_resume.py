@@ -1,9 +1,7 @@
-"""Runs that are killed or run out of disk space end as if uninterrupted."""
+"""Runs and trainings that are killed end as if uninterrupted."""
 
 import multiprocessing
 import time
-from contextlib import ExitStack
-from functools import partial
 
 import numpy as np
 import pytest
@@ -11,8 +9,6 @@ import torch
 
 from bgpo_trl.data.dataset import load_demonstrations
 from bgpo_trl.encoders.pretrained import load_pretrained
-from bgpo_trl.files.checkpoint import load_checkpoint
-from tests.helpers import at_step, largest_file
 from tests.resumable import play, train_small_encoders
 from tests.test_training import assert_same_run
 
@@ -64,19 +60,6 @@ def assert_same_encoders(first, second):
 
 
 @pytest.fixture(scope="module")
-def make(easy_world, begin, make_config):
-    """Make the trainer of a small run with a checkpoint after each step."""
-    return partial(begin, config=make_config("state", "ddpg", checkpoint_minutes=0.0))
-
-
-@pytest.fixture(scope="module")
-def uninterrupted(make, tmp_path_factory):
-    directory = tmp_path_factory.mktemp("uninterrupted")
-    make(directory).run()
-    return directory
-
-
-@pytest.fixture(scope="module")
 def learned(tmp_path_factory):
     directory = tmp_path_factory.mktemp("learned")
     train_small_encoders(directory)
@@ -112,25 +95,3 @@ def test_encoder_training_killed_several_times_gives_the_same_encoders(learned, 
     for name in ("demonstrations/dataset.json", "log/probes.json"):
         assert (tmp_path / name).read_text() == (learned / name).read_text()
     load_demonstrations(tmp_path / "demonstrations")  # compares the checksum
-
-
-@pytest.mark.parametrize("full", ["checkpoint", "train.csv"])
-def test_a_run_ended_by_a_full_disk_can_be_resumed(uninterrupted, make, tmp_path, full):
-    trainer = make(tmp_path)
-    with ExitStack() as stack:
-
-        def fill_the_disk():
-            if full == "checkpoint":
-                room = 10_000
-            else:
-                room = (tmp_path / full).stat().st_size + 9
-                trainer.save = lambda: None  # none is due before the next row
-            stack.enter_context(largest_file(room))
-
-        at_step(trainer, 9, fill_the_disk)
-        with pytest.raises(OSError, match="make room"):
-            trainer.run()
-    assert load_checkpoint(tmp_path / "checkpoint")["env_steps"] == 8
-    assert (tmp_path / "train.csv").read_bytes().endswith(b"\n")
-    make(tmp_path, resume=True).run()
-    assert_same_run(tmp_path, uninterrupted)

@@ -1,27 +1,12 @@
-"""Named streams of random numbers: reproducible, distinct, and the same in any batch."""
+"""Named streams of random numbers: reproducible and distinct."""
 
 import itertools
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
-from bgpo_trl.seeding import generators, row_seeds, stream_seed
-
-seeds = st.integers(0, 2**40)
-names = st.sampled_from(
-    ["env", "demonstrations", "gwr", "actor", "critic", "replay", "exploration", "evaluation"]
-)
-
-
-@given(seeds, names)
-def test_seed_and_name_determine_a_stream_for_any_generator(seed, name):
-    number = stream_seed(seed, name)
-    assert number == stream_seed(seed, name)
-    np.random.RandomState(number)
-    assert torch.Generator().manual_seed(number).initial_seed() == number
+from bgpo_trl.seeding import row_seeds, stream_seed
 
 
 def test_streams_are_those_of_earlier_versions():
@@ -35,13 +20,7 @@ def test_no_two_streams_are_the_same():
         for seed, name in itertools.product(range(200), ["env", "actor", "critic", "replay"])
     }
     assert len(numbers) == 800
-
-
-@given(st.lists(seeds, min_size=1, max_size=4, unique=True), names)
-def test_a_seed_has_the_same_generator_in_any_batch(batch, name):
-    for seed, together in zip(batch, generators(batch, name), strict=True):
-        (alone,) = generators([seed], name)
-        assert torch.rand(3, generator=together).equal(torch.rand(3, generator=alone))
+    assert min(numbers) >= 0 and max(numbers) < 2**32  # as any generator takes them
 
 
 def test_rows_have_the_seeds_given_count_up_from_one_or_have_fresh_ones():

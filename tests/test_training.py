@@ -21,13 +21,12 @@ from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.training import Trainer
 from tests.algorithms.playing import assert_same
 from tests.conftest import of_name
-from tests.helpers import DISTINCT, Recorder, at_step, contents, interrupt, rows
+from tests.helpers import DISTINCT, Recorder, at_step, contents, finish, interrupt, rows
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 CSV_FILES = ("train.csv", "eval.csv")
 TASKS = ("grasp_glass", "push_green_to_glass", "push_green_to_white")
 ROUNDED = ("intrinsic_return", "loss_actor", "loss_value")
-LEARNERS = DISTINCT
 # Algorithms that need data of each task begin to learn later.
 LONGER = {"maml": {"episodes": 16}, "dist-nll": {"episodes": 16}}
 
@@ -108,7 +107,7 @@ def test_all_presented_tasks_are_tested_every_few_episodes(begin, make_config, t
         assert int(row["success"]) == float(row["return"])
 
 
-@pytest.mark.parametrize(("name", "seed"), zip(LEARNERS, itertools.cycle((3, 8)), strict=False))
+@pytest.mark.parametrize(("name", "seed"), zip(DISTINCT, itertools.cycle((3, 8)), strict=False))
 def test_rows_of_a_seed_equal_those_of_the_seed_alone(
     run_of, begin, config_of, tmp_path, name, seed
 ):
@@ -148,22 +147,11 @@ def test_training_draws_seen_demonstrations_and_tests_held_out_ones(
         assert (shown.unsqueeze(1) == allowed.embedding).all(-1).any(1).all()
 
 
-@pytest.mark.parametrize("name", ["maml", "ddpg"])
-def test_policies_may_learn_from_the_true_state_without_encoders(
-    begin, make_config, tmp_path, name
-):
-    begin(tmp_path, make_config("state", name, episodes=6), encoders=None).run()
-    train = rows(tmp_path / "train.csv")
-    assert {(row["num_nodes"], row["intrinsic_return"]) for row in train} == {("0", "0.0")}
-    assert {row["success"] for row in train} == {"0", "1"}
-
-
 def test_an_algorithm_may_be_made_under_another_name(begin, make_config, tmp_path):
     config = replace(make_config("state", "ddpg", episodes=2), name="mine")
     with pytest.raises(ValueError, match="no algorithm 'mine'"):
         begin(tmp_path / "refused", config)
-    trainer = begin(tmp_path, config, make=ALGORITHMS["ddpg"].make)
-    trainer.run()
+    trainer = finish(begin(tmp_path, config, make=ALGORITHMS["ddpg"].make))
     assert trainer.algorithm.config == config.algorithm
     for file in CSV_FILES:
         assert {row["algorithm"] for row in rows(tmp_path / file)} == {"mine"}
@@ -183,8 +171,7 @@ class WithEntropy(BGPO):
 
 def test_an_algorithm_may_log_further_losses(uninterrupted, begin, tmp_path):
     recorder = Recorder()
-    with begin(tmp_path, make=WithEntropy, loggers=[recorder]) as trainer:
-        trainer.run()
+    trainer = finish(begin(tmp_path, make=WithEntropy, loggers=[recorder]))
     ours, usual = rows(tmp_path / "train.csv"), rows(uninterrupted / "train.csv")
     assert [list(row)[-2:] for row in ours[:1]] == [["loss_entropy", "loss_missing"]]
     logged = [(float(row.pop("loss_entropy")), row.pop("loss_missing")) for row in ours]
@@ -209,8 +196,7 @@ def test_an_update_follows_every_so_many_steps(begin, make_config, tmp_path):
             calls.append(len(self.replay))
             return super().update()
 
-    with begin(tmp_path, config, make=Counted) as trainer:
-        trainer.run()
+    trainer = finish(begin(tmp_path, config, make=Counted))
     assert calls == [*range(0, trainer.env_steps, 3)]  # transitions stored before
 
 
@@ -218,10 +204,8 @@ def test_a_longer_run_logs_the_episodes_of_seeds_that_were_ahead(begin, make_con
     config, short, long = make_config("state", "ddpg"), Recorder(), Recorder()
     begin(tmp_path / "run", replace(config, episodes=4)).run()
     assert load_checkpoint(tmp_path / "run" / "checkpoint")["later"]
-    with begin(tmp_path / "run", config, resume=True, loggers=[short]) as trainer:
-        trainer.run()
-    with begin(tmp_path / "whole", config, loggers=[long]) as trainer:
-        trainer.run()
+    finish(begin(tmp_path / "run", config, resume=True, loggers=[short]))
+    finish(begin(tmp_path / "whole", config, loggers=[long]))
     assert [step for _, step in short.metrics] == [6, 8, 10]
     assert short.metrics == long.metrics[-3:]
 
@@ -245,7 +229,7 @@ def test_wrong_results_of_an_algorithm_are_refused(
         begin(tmp_path, make_config("state", "ddpg", episodes=2)).run()
 
 
-@pytest.mark.parametrize("name", [*LEARNERS, "clone"])
+@pytest.mark.parametrize("name", [*DISTINCT, "clone"])
 def test_a_run_interrupted_several_times_is_the_same(run_of, begin, config_of, tmp_path, name):
     """A signal waits for the end of the step; also if loggers are added to the resumed run."""
     config = config_of(name)
@@ -264,8 +248,7 @@ def test_a_run_interrupted_several_times_is_the_same(run_of, begin, config_of, t
     if name == "ewc":
         assert max(saved["algorithm"]["replay"]["n_added"]) < sum(steps)  # emptied at a boundary
     recorder = Recorder()
-    with begin(tmp_path, config, resume=True, loggers=[recorder]) as resumed:
-        resumed.run()
+    finish(begin(tmp_path, config, resume=True, loggers=[recorder]))
     assert recorder.metrics[-1][1] == config.episodes
     assert_same_run(tmp_path, run_of(name))
     ours, theirs = (read_table(run / "cost.csv") for run in (tmp_path, run_of(name)))
@@ -429,16 +412,14 @@ def test_tasks_begin_for_each_seed_before_they_are_played(begin, make_config, tm
     config = make_config("state", "ddpg", task_starts=(3, 0, 3), schedule="sequential")
     config = replace(config, name="attentive", episodes=6)
     parts = {"make": Attentive, "resume": True}
-    with begin(tmp_path / "whole", config, **parts) as whole:
-        whole.run()
+    whole = finish(begin(tmp_path / "whole", config, **parts))
     played = rows(tmp_path / "whole" / "train.csv")
     ends = [int(row["env_steps"]) for row in played if row["episode"] == "3"]
     assert ends[0] != ends[1]
     for step in sorted({end - before for end in ends for before in (0, 1)}):
         trainer = begin(tmp_path / "run", config, **parts)
         interrupt(trainer, step - trainer.env_steps)
-    with begin(tmp_path / "run", config, **parts) as resumed:
-        resumed.run()
+    resumed = finish(begin(tmp_path / "run", config, **parts))
     for trainer in (whole, resumed):
         for notes in trainer.algorithm.notes:
             assert notes[:5] == [*[("played", 1)] * 3, ("begin", 0), ("begin", 2)]
@@ -460,8 +441,7 @@ def test_only_algorithms_that_are_given_boundaries_depend_on_them(
     run_of, begin, config_of, tmp_path, monkeypatch, name, needs
 ):
     monkeypatch.setattr(Trainer, "_begin_tasks", lambda trainer, index: None)
-    with begin(tmp_path, config_of(name)) as trainer:
-        trainer.run()
+    trainer = finish(begin(tmp_path, config_of(name)))
     assert trainer.algorithm.needs_boundaries == needs
     if needs:
         assert (tmp_path / "train.csv").read_text() != (run_of(name) / "train.csv").read_text()

@@ -12,7 +12,7 @@ import pytest
 import wandb
 
 from bgpo_trl.runs.dashboard import wandb_logger
-from tests.helpers import interrupt
+from tests.helpers import finish, interrupt
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 
@@ -39,10 +39,8 @@ def test_sessions_of_a_run_are_one_run_that_names_no_place_of_this_machine(
     run = tmp_path / "run"
     start = partial(wandb_logger, run, "offline", "continual-bgpo")
     config = make_config("state", "ddpg")
-    with begin(run, config, loggers=[start]) as interrupted:
-        interrupt(interrupted, 12)
-    with begin(run, config, loggers=[start], resume=True) as resumed:
-        resumed.run()
+    interrupt(begin(run, config, loggers=[start]), 12)
+    finish(begin(run, config, loggers=[start], resume=True))
     logged = pd.read_csv(run / "eval.csv").groupby("episode")["success"].mean()
     # Another process writes them, and may end after the call that finishes the run.
     deadline = time.monotonic() + 60

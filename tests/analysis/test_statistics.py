@@ -60,12 +60,6 @@ def test_the_verdict_follows_from_the_intervals(low, high, narrow, verdict):
     assert found.verdict == verdict
 
 
-def test_p_values_by_hand():
-    assert statistics.permutation_p([0, 0], [1, 1]) == pytest.approx(2 / 6)
-    assert statistics.permutation_p(np.zeros(5), np.ones(5)) == pytest.approx(2 / 252)
-    assert statistics.permutation_p([0, 1], [1, 0]) == 1
-
-
 def test_estimates_are_rounded_and_clipped():
     assert statistics.Estimate(0.98, 0.94, 1.02).percent() == "98.0 [94, 100]"
     assert statistics.Estimate(0.02, -0.02, 0.06).percent() == "2.0 [0, 6]"

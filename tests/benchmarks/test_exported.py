@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks.speed import exported
 from bgpo_trl.policy import load_run
+from tests.helpers import finish
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 
@@ -15,8 +16,7 @@ pytestmark = pytest.mark.usefixtures("easy_world")
 @pytest.fixture(scope="module")
 def run(easy_world, begin, make_config, tmp_path_factory):
     directory = tmp_path_factory.mktemp("run") / "run"
-    with begin(directory, make_config(episodes=3, eval_every=3)) as trainer:
-        trainer.run()
+    finish(begin(directory, make_config(episodes=3, eval_every=3)))
     return directory
 
 

@@ -99,13 +99,6 @@ def test_results_are_written_and_printed(tmp_path, capsys, monkeypatch):
     assert "| 2 | 30 |" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("nodes", [(), (20,), (20, 20), (1, 20)])
-def test_an_exponent_needs_two_sizes(tmp_path, nodes):
-    with pytest.raises(ValueError, match="--nodes"):
-        gwr.main(gwr.Arguments(tmp_path / "out", nodes=nodes))
-    assert not (tmp_path / "out").exists()
-
-
 def test_exponent_of_a_power_law_is_its_power():
     rows = [{"nodes": n, "call": {"median": 3 * n**0.5}} for n in (10, 70, 900)]
     assert gwr.slope(rows, "call") == pytest.approx(0.5)

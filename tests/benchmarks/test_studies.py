@@ -12,13 +12,13 @@ from benchmarks.studies.trained import POLICIES, Row, summarized
 from bgpo_trl.modules.actor_critic import Actor, Critic, ProposalPolicy
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
+from tests.helpers import finish
 
 
 @pytest.mark.usefixtures("easy_world")
 def test_gwr_grows_without_a_policy_as_in_a_run(begin, make_config, bank, tmp_path):
     config = make_config(name="bgpo-paper", episodes=60)
-    with begin(tmp_path / "run", config) as trainer:
-        trainer.run()
+    finish(begin(tmp_path / "run", config))
     rows = pd.read_csv(tmp_path / "run" / "train.csv")
     arguments = Arguments(tmp_path, seeds=config.seeds, episodes=60, every=1)
     _, nodes = grow(bank.seen(), config.task_starts, 1.0, arguments)

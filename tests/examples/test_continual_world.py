@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-from bgpo_trl.scenes import find_scene
-
 pytest.importorskip("metaworld", reason="Meta-World is not installed (docs/extending.md)")
 
 from examples.continual_world import CW10, WITH_GOAL, WITH_PUCK, ContinualWorld
@@ -22,13 +20,6 @@ def begin(worlds, task, seed=0):
     simulation.seed(seed)
     simulation.reset(task)
     return simulation
-
-
-def test_the_scene_has_the_ten_tasks_and_their_order():
-    scene = find_scene("cw10")
-    assert scene.default_tasks == CW10
-    assert len({*CW10}) == 10
-    assert scene.max_steps == 50
 
 
 @pytest.mark.parametrize("task", WITH_GOAL)

@@ -2,11 +2,8 @@
 
 import numpy as np
 import pytest
-import torch
-from torchrl.envs.utils import check_env_specs
 
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.scenes import find_scene
 
 pytest.importorskip("metaworld", reason="Meta-World is not installed (docs/extending.md)")
 
@@ -36,24 +33,6 @@ def assert_same(a, b):
 
 
 @pytest.mark.parametrize("task", FIVE)
-def test_a_start_depends_on_seed_and_episode_alone(simulation, worlds, task):
-    simulation.seed(3)
-    simulation.reset(FIVE[FIVE.index(task) - 1])
-    act_at_random(simulation, 5)
-    simulation.reset(task)
-    other = MetaWorld(worlds)
-    other.seed(3)
-    other.reset(task)
-    act_at_random(other, 7)
-    other.reset(task)
-
-    assert_same(simulation, other)
-    first = simulation.observation[4:7].copy()
-    simulation.reset(task)
-    assert not np.array_equal(simulation.observation[4:7], first)
-
-
-@pytest.mark.parametrize("task", FIVE)
 def test_simulations_of_one_world_do_not_influence_each_other(simulation, worlds, task):
     beside, alone = MetaWorld(worlds), MetaWorld()
     for each, seed in ((simulation, 1), (beside, 2), (alone, 1)):
@@ -69,9 +48,11 @@ def test_simulations_of_one_world_do_not_influence_each_other(simulation, worlds
 
 @pytest.mark.parametrize("task", FIVE)
 def test_a_saved_episode_continues_bit_by_bit(simulation, task):
+    """Hence starts, each another one, depend on seed and episode alone."""
     simulation.seed(8)
     simulation.reset(FIVE[FIVE.index(task) - 2])
     simulation.reset(task)
+    first = simulation.observation[4:7].copy()
     act_at_random(simulation, 9)
     resumed = MetaWorld()
     resumed.load(simulation.save())
@@ -83,6 +64,7 @@ def test_a_saved_episode_continues_bit_by_bit(simulation, task):
     for each in (simulation, resumed):
         each.reset(task)
     assert_same(simulation, resumed)
+    assert not np.array_equal(simulation.observation[4:7], first)
 
 
 def test_a_simulation_saved_before_its_first_episode_keeps_its_seed(simulation):
@@ -119,26 +101,6 @@ def test_success_has_to_last_for_two_actions(simulation, monkeypatch):
     monkeypatch.setattr(type(simulation.world.env), "step", step)
     outcomes = [simulation.step(np.zeros(4)).success for _ in range(4)]
     assert outcomes == [False, False, False, True]
-
-
-def test_the_scene_is_an_environment_whose_seeds_do_not_depend_on_each_other():
-    scene = find_scene("metaworld")
-    env = scene.simulate(FIVE[:2], batch_size=[2], seed=[4, 9], observation="both")
-    check_env_specs(env)
-    actions = torch.rand(2, 3, 4, generator=torch.Generator().manual_seed(0)) * 2 - 1
-
-    def play(env, actions):
-        env.set_seed(4)
-        state = env.reset()
-        for action in actions.unbind(1):
-            state = env.step(state.set("action", action))["next"]
-        return state
-
-    both = play(env, actions)
-    alone = play(scene.simulate(FIVE[:2], batch_size=[1]), actions[:1])
-    assert both["pixels"].shape == (2, 32, 64, 3)
-    assert both["pixels"][:1].equal(alone["pixels"])
-    assert not both["pixels"][0].equal(both["pixels"][1])
 
 
 def test_demonstrations_are_recorded(tmp_path):

@@ -17,6 +17,7 @@ from bgpo_trl.experiments import run as experiment
 from bgpo_trl.policy import LoadedRun
 from suites import nico
 from suites.nico.base import STATE_CENTER, STATE_SCALE
+from tests.helpers import finish
 
 
 @pytest.fixture
@@ -67,8 +68,7 @@ def finished_runs(begin, make_config, tmp_path_factory):
     @cache
     def finished(name):
         directory = tmp_path_factory.mktemp(name)
-        with begin(directory, make_config(name=name)) as trainer:
-            trainer.run()
+        finish(begin(directory, make_config(name=name)))
         return directory
 
     return finished

@@ -54,6 +54,8 @@ CASES = [
     ("concurrent_tasks.py --device cuda:99", "cuda:99"),
     ("bgpo continual --config new", "--config"),
     ("eight_tasks.py --eval-every 0", "eval_every"),
+    ("bgpo continual --episodes 10 --eval-every 50", "eval_every must be at most the 10 episodes"),
+    ("bgpo concurrent --task-starts 0 5 5", "--task-starts"),
     ("bgpo continual --eval-episodes 0", "set eval_episodes to at least 1"),
     ("speed/steps.py ppo", "no algorithm 'ppo'"),
     # tasks and their demonstrations
@@ -61,6 +63,8 @@ CASES = [
     ("bgpo continual --import juggling", "--import juggling"),
     ("bgpo continual --bank file", "file is damaged or not a bank"),
     ("bgpo continual --bank new --train-encoders", "--bank"),
+    ("bgpo continual --add-task lift_green", "--add-task: name a run with --resume and --out"),
+    ("bgpo concurrent --add-task lift_green", "is for `bgpo continual`"),
     # where results go
     ("continual.py --out file/run", "cannot make the folder file/run"),
     ("bgpo continual --preset quick --out run --resume", "algorithm holds no settings"),
@@ -71,6 +75,14 @@ CASES = [
     ("bgpo report run", "run holds no test episode"),
     ("studies/aftermath.py empty", "empty holds no run"),
     ("studies/aftermath.py", "nobody acts"),
+    # grids of runs
+    ("bgpo sweep --block 0", "--block"),
+    ("bgpo sweep --seeds 1 2 1", "seeds"),
+    ("bgpo sweep --settings eight --tasks grasp_glass", "--tasks"),
+    ("bgpo sweep --algorithms", "--algorithms"),
+    ("bgpo sweep --settings", "--settings"),
+    ("bgpo sweep --cpus-per-run 0", "--cpus-per-run"),
+    ("bgpo sweep --gpus-per-run -1", "--gpus-per-run"),
     # measurements
     ("studies/aftermath.py --demonstrators --episodes 0", "--episodes"),
     ("bgpo groups --draws 0", "--draws"),
@@ -80,6 +92,8 @@ CASES = [
     ("studies/tasks.py --pictures no-such-folder", "no-such-folder"),
     ("speed/throughput.py --parts", "--parts"),
     ("speed/gwr.py --networks 0", "--networks"),
+    ("speed/gwr.py --nodes 20 20", "--nodes"),
+    ("speed/gwr.py --nodes 1 20", "--nodes"),
     # encoders
     ("bgpo record file", "cannot make the folder file"),
     ("bgpo record new --per-task 0", "held_out_per_task"),

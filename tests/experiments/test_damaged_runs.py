@@ -56,18 +56,6 @@ def write(name, content):
     return lambda run: (run / name).write_bytes(content)
 
 
-def replaced(name, old, new):
-    return lambda run: (run / name).write_text((run / name).read_text().replace(old, new, 1))
-
-
-def without_lines(name, text):
-    def do(run):
-        lines = (run / name).read_text().splitlines(keepends=True)
-        (run / name).write_text("".join(line for line in lines if text not in line))
-
-    return do
-
-
 def damages(name):
     """Kinds of damage that any file may have."""
     return {
@@ -87,12 +75,6 @@ REPORTED = {
     "starts of other tasks": settings(task_starts=[0, 1]),
     "tasks by number": settings(tasks=[1, 2, 3]),
     "nodes in words": lambda run: edit(run / "summary.json", nodes="many"),
-    "training of a longer run": settings(episodes=20),
-    "success that is no number": replaced("final.csv", "0.5", "nan"),
-    "inference that is no number": replaced("final.csv", "0.25", "perhaps"),
-    "a row cut short": replaced("final.csv", ",20,0.5,0.25", ""),
-    "no held-out tests": without_lines("final.csv", "held-out"),
-    "a seed without late tests": without_lines("eval.csv", "bgpo,8,10"),
 }
 # These files are optional, and nothing in the summary is required.
 for _name in ("final.csv missing", "summary.json missing", "summary.json of something else"):

@@ -23,8 +23,7 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize(
-    ("torch", "fits"),
-    [("2.13.0", True), ("2.14.1+cu128", True), ("2.12.9", False), ("3.0", False)],
+    ("torch", "fits"), [("2.13.0", True), ("2.14.1+cu128", True), ("2.12.9", False), ("3.0", False)]
 )
 def test_all_that_is_missing_or_does_not_fit_is_installed_by_one_line(monkeypatch, torch, fits):
     """Extras are not required."""
@@ -83,17 +82,13 @@ def test_a_full_disk_is_wrong(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("content", "backend", "wrong"),
+    ("content", "backend", "cause"),
     [
-        (
-            "raise ImportError('libcudart is missing')\n",
-            "egl",
-            {"nico": "libcudart"},
-        ),
-        (None, "vulkan", {"nico": "'vulkan'"}),
+        ("raise ImportError('libcudart is missing')\n", "egl", "libcudart"),
+        (None, "vulkan", "'vulkan'"),
     ],
 )
-def test_a_broken_torch_and_an_unknown_backend_are_reported(tmp_path, content, backend, wrong):
+def test_a_broken_torch_and_an_unknown_backend_are_reported(tmp_path, content, backend, cause):
     if content is not None:
         (tmp_path / "torch").mkdir()
         (tmp_path / "torch" / "__init__.py").write_text(content)
@@ -111,6 +106,5 @@ def test_a_broken_torch_and_an_unknown_backend_are_reported(tmp_path, content, b
     lines = [line.split(maxsplit=2) for line in process.stdout.splitlines()]
     found = {subject: (level, message) for level, subject, message in lines}
     assert [*found] == ["versions", "nico", "disk"]
-    assert {subject for subject, (level, _) in found.items() if level == "wrong"} == {*wrong}
-    for subject, cause in wrong.items():
-        assert cause in found[subject][1]
+    assert [subject for subject, (level, _) in found.items() if level == "wrong"] == ["nico"]
+    assert cause in found["nico"][1]

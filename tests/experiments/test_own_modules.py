@@ -1,6 +1,7 @@
 """Algorithms and tasks from outside the package, in commands with ``--import`` of their module."""
 
 import json
+import re
 import sys
 from dataclasses import replace
 
@@ -67,8 +68,10 @@ nico.add_task("at_once", AtOnce)
 
 @pytest.fixture(autouse=True)
 def folder(undrawn, shipped, tmp_path, monkeypatch):
-    """The current folder, with a module in it that is forgotten after the test."""
+    """The current folder, with modules in it that are forgotten after the test."""
     (tmp_path / "mine_at_once.py").write_text(MODULE)
+    (tmp_path / "astray.py").write_text("import no_such_library\n")
+    (tmp_path / "json.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
     yield tmp_path
@@ -109,3 +112,23 @@ def test_a_task_and_an_algorithm_of_a_module_are_trained_reported_filmed_and_tes
     one_shot(OneShotArguments(run=run, shares=(1.0,), episodes=2))
     table = read_table(run / "one_shot.csv")[["seed", "task", "success"]]
     assert table.to_numpy().tolist() == [[3, "at_once", 1.0], [8, "at_once", 1.0]]
+
+
+@pytest.mark.parametrize(
+    "name", ["mine", "mine_at_once.py", "mine_at_once.tasks", "no.such", "./mine", ".mine", ""]
+)
+def test_a_missing_module_is_refused(folder, name):
+    message = rf"^--import {re.escape(name)}: there is no such module in {folder}"
+    with pytest.raises(ValueError, match=message):
+        import_plugin(name)
+
+
+def test_an_import_error_within_the_module_is_raised_unchanged():
+    with pytest.raises(ModuleNotFoundError, match="no_such_library"):
+        import_plugin("astray")
+
+
+def test_a_module_hidden_by_another_one_is_refused():
+    with pytest.raises(ValueError, match=r"^--import json: .*json.* has the same name: rename "):
+        import_plugin("json")
+    assert "mine" not in ALGORITHMS

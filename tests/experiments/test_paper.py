@@ -10,10 +10,10 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
-import torch
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis.comparison import NAMES
@@ -41,13 +41,9 @@ def json_of(run, name):
     return json.loads((run / f"{name}.json").read_text())
 
 
-def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path):
+def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path, refused):
     run = tmp_path / "a run"
     printed = concurrent(Arguments(out=run))
-    for task, of_task in (
-        read_table(run / "final.csv").query("demonstrations == 'held-out'").groupby("task")
-    ):
-        assert f"{task}: {of_task['success'].mean():.0%} of held-out tests succeed" in printed
     assert "docs/extending.md says where to look" in printed  # after six episodes
     assert "GWR-B nodes: [" in printed and "groups of behaviors: [" in printed
     assert shlex.split(printed)[-3:] == ["bgpo", "report", str(run)]
@@ -55,7 +51,6 @@ def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path):
     solved = read_table(run / "eval.csv")["success"].any()
     steps = ["steps.png"] if solved else []
     assert figures == {*FIGURES, *steps, *(f"{task}.gif" for task in TASKS)}
-    assert json_of(run, "config")["task_starts"] == [0, 0, 0]
 
     tests = read_table(run / "final.csv")
     keys = tests[["seed", "demonstrations", "task"]].itertuples(index=False, name=None)
@@ -63,18 +58,14 @@ def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path):
         (seed, kind, task) for seed in (3, 8) for kind in ("seen", "held-out") for task in TASKS
     )
     assert set(2 * tests["success"]) <= {0, 1, 2}
-    assert tests["task_inference"].between(0, 1).all()
     assert (tests["steps"].notna() == (tests["success"] > 0)).all()
     summary = json_of(run, "summary")
     assert re.fullmatch(r"|[0-9a-f]{7,}(-dirty)?", summary["commit"])
     assert summary["versions"]["torch"] == importlib.metadata.version("torch")
     by_chance = dict(zip(TASKS, [0.1, 0.2, 0.3], strict=True))
     assert summary["random_success"] == pytest.approx(by_chance)
-
-    before = contents(run)
-    with pytest.raises(ValueError, match="holds a run: --resume continues it, --out names another"):
-        concurrent(Arguments(out=run))
-    assert contents(run) == before
+    again = partial(concurrent, Arguments(out=run))
+    refused(again, "holds a run: --resume continues it", "--out names another")
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -109,7 +100,9 @@ def test_every_algorithm_runs_and_is_reported_under_its_name(tiniest, tmp_path, 
         assert shown == pytest.approx(expected, abs=0.05)
 
 
-def test_a_finished_run_is_only_changed_by_making_it_longer(undrawn, tmp_path, monkeypatch):
+def test_a_finished_run_is_only_changed_by_making_it_longer(
+    undrawn, tmp_path, monkeypatch, refused
+):
     run = tmp_path / "run"
     arguments = Arguments(out=run)
     continual(arguments)
@@ -122,15 +115,12 @@ def test_a_finished_run_is_only_changed_by_making_it_longer(undrawn, tmp_path, m
             assert continual(same).startswith(f"{run} is finished, all 6 episodes")
     assert contents(run) == before
 
-    seed, every = ("--seeds", "3"), ("--eval-every", "3")
-    others = [{"episodes": 5}, {"settings": seed}, {"settings": every}]
-    others.append({"episodes": 9, "settings": every})
-    for other in others:
-        with pytest.raises(ValueError, match="holds a run with other settings"):
-            continual(replace(again, **other))
-    with pytest.raises(ValueError, match=r"with other settings .*task_starts is \[0, 2, 4\] there"):
-        concurrent(replace(again, episodes=9))
-    assert contents(run) == before
+    seed, every = {"settings": ("--seeds", "3")}, {"settings": ("--eval-every", "3")}
+    for other in ({"episodes": 5}, seed, every, {"episodes": 9, **every}):
+        changed = partial(continual, replace(again, **other))
+        refused(changed, "holds a run with other settings", "choose another")
+    from_start = partial(concurrent, replace(again, episodes=9))
+    refused(from_start, "task_starts is [0, 2, 4] there", "choose another")
 
     (run / "final.csv").unlink()  # as if it had been interrupted in its last tests
     continual(again)
@@ -142,13 +132,12 @@ def test_a_finished_run_is_only_changed_by_making_it_longer(undrawn, tmp_path, m
     kept = (config["episodes"], config["task_starts"], config["eval_every"])
     assert kept == (9, [0, 2, 4], 2)
     assert json_of(run, "summary")["episodes"] == 9
-    train = (run / "train.csv").read_text()
-    assert train.startswith(played)
-    assert train.count("\n") == 1 + 2 * 9
     assert continual(replace(again, episodes=9)).startswith(f"{run} is finished, all 9 episodes")
 
 
-def test_a_run_is_continued_and_repeated_with_its_own_settings(undrawn, tmp_path, monkeypatch):
+def test_a_run_is_continued_and_repeated_with_its_own_settings(
+    undrawn, tmp_path, monkeypatch, refused
+):
     """A run of other settings than the preset's, also when it is extended, and in its folder."""
     run = tmp_path / "run"
     begun = Arguments(
@@ -162,12 +151,10 @@ def test_a_run_is_continued_and_repeated_with_its_own_settings(undrawn, tmp_path
     config = json_of(run, "config")
     assert (config["name"], config["algorithm"]["beta"]) == ("bgpo-single", 0.3)
     assert (run / "train.csv").read_text().startswith(played)
-    before = contents(run)
-    with pytest.raises(ValueError, match="holds a run with other settings"):
-        continual(replace(alone, algorithm="bgpo"))
+    other = partial(continual, replace(alone, algorithm="bgpo"))
+    refused(other, "name is bgpo-single there and bgpo here", "choose another")
     monkeypatch.chdir(run)
     assert continual(Arguments(resume=True)).startswith(f"{run} is finished, all 5 episodes")
-    assert contents(run) == before
     assert json_of(run, "summary")["changed"] == {"beta": 0.3}
 
     again = tmp_path / "again"
@@ -263,15 +250,13 @@ def test_the_smoke_preset_passes_every_stage_although_it_is_interrupted(tmp_path
 
 
 def test_a_run_that_was_interrupted_while_it_made_encoders_is_resumed(
-    undrawn, tmp_path, monkeypatch, encoders, bank
+    undrawn, tmp_path, monkeypatch, encoders, bank, refused
 ):
     monkeypatch.setattr(experiment, "make_pretrained", lambda *_, **__: (encoders, bank))
     monkeypatch.setattr(experiment, "verdict_in", lambda *_: "")
     (tmp_path / "demonstrations").mkdir()
     arguments = Arguments(out=tmp_path, resume=True, episodes=2)
-    with pytest.raises(ValueError, match="beginning of new encoders: add --train-encoders"):
-        continual(arguments)
-    assert [path.name for path in tmp_path.iterdir()] == ["demonstrations"]
+    refused(lambda: continual(arguments), "beginning of new encoders", "add --train-encoders")
     continual(replace(arguments, train_encoders=True))
     assert (tmp_path / "summary.json").exists()
 
@@ -300,13 +285,8 @@ def test_new_encoders_are_trained_with_the_settings_of_a_file(
 def test_a_task_is_added_to_a_finished_run_and_reported(undrawn, tmp_path, encoders, bank):
     run = tmp_path / "run"
     continual(Arguments(out=run))
-    further = replace(
-        bank.of_task(2),
-        task=torch.zeros(12, dtype=torch.int64),
-        tasks=("lift_green",),
-        encoder_id=encoders.identity,
-        scene=encoders.metadata["scene"],
-    )
+    of_encoders = {"encoder_id": encoders.identity, "scene": encoders.metadata["scene"]}
+    further = replace(bank.for_tasks(TASKS[2:]), tasks=("lift_green",), **of_encoders)
     further.save(tmp_path / "further.safetensors")
     options = {"add_task": "lift_green", "bank": tmp_path / "further.safetensors"}
     command = Arguments(out=run, resume=True, episodes=16, **options)
@@ -319,10 +299,6 @@ def test_a_task_is_added_to_a_finished_run_and_reported(undrawn, tmp_path, encod
     assert json_of(run, "config")["tasks"] == [*TASKS, "lift_green"]
     assert json_of(run, "config")["task_starts"][-1] > 6
     assert "is finished, all 16 episodes" in continual(Arguments(out=run, resume=True))
-    with pytest.raises(ValueError, match="with --resume and --out"):
-        continual(replace(command, resume=False))
-    with pytest.raises(ValueError, match="is for `bgpo continual`"):
-        concurrent(command)
 
 
 def test_a_run_says_what_it_reached_and_in_how_many_steps():

@@ -1,12 +1,11 @@
 """Content of the figures of GWR-B's nodes."""
 
-import itertools
-
 import numpy as np
 import pytest
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
+from scipy.spatial.distance import pdist
 
 from bgpo_trl.figures.gwr import plot_gwr_pca
 
@@ -20,10 +19,7 @@ def test_components_keep_distances_within_a_plane():
     figure = plot_gwr_pca(torch.from_numpy(weights), torch.zeros(40, dtype=torch.long), ["a"])
     (axes,) = figure.axes
     points = np.asarray(axes.collections[0].get_offsets())
-    for i, j in itertools.combinations(range(40), 2):
-        assert np.linalg.norm(points[i] - points[j]) == pytest.approx(
-            np.linalg.norm(weights[i] - weights[j])
-        )
+    np.testing.assert_allclose(pdist(points), pdist(weights))
     assert points.var(axis=0)[0] > points.var(axis=0)[1]
     np.testing.assert_allclose(points.mean(axis=0), 0, atol=1e-9)
     np.testing.assert_allclose(np.cov(points.T)[0, 1], 0, atol=1e-9)
@@ -35,8 +31,6 @@ def test_axes_are_labeled_with_the_share_of_variance():
     (axes,) = plot_gwr_pca(weights, np.zeros(4, dtype=int), ["a"]).axes
     assert axes.get_xlabel() == "Principal component 1 (90% of variance)"
     assert axes.get_ylabel() == "Principal component 2 (10% of variance)"
-    points = np.asarray(axes.collections[0].get_offsets())
-    np.testing.assert_allclose(points, weights[:, :2], atol=1e-12)
 
 
 def test_nodes_are_colored_by_task_and_in_a_second_panel_by_group():

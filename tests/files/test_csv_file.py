@@ -25,6 +25,8 @@ def test_rows_are_written_at_once_and_continued_after_reopening(tmp_path):
     # Reopened without a close, as after a kill.
     second = CsvFile(path, COLUMNS)
     second.write({"episode": 2, "task": 'push "green", slowly', "return": 1})
+    with pytest.raises(ValueError, match="has no column loss"):
+        second.write({"episode": 3, "loss": 0.5})
     assert path.read_bytes() == HEAD + b'1,,0.1\n2,"push ""green"", slowly",1\n'
 
 
@@ -65,25 +67,6 @@ def test_a_partial_last_row_is_dropped(tmp_path):
             file.write({"episode": 3})
         rows = b"1,grasp,0\n" if cut >= len(HEAD) + 10 else b""
         assert path.read_bytes() == HEAD + rows + b"3,,\n", cut
-
-
-@pytest.mark.parametrize("kept", range(4))
-def test_a_truncated_and_continued_file_equals_an_uninterrupted_one(kept, tmp_path):
-    rows = [{"episode": episode, "return": 0.1**episode} for episode in range(3)]
-    with CsvFile(tmp_path / "straight.csv", COLUMNS) as straight:
-        for row in rows:
-            straight.write(row)
-    interrupted = CsvFile(tmp_path / "resumed.csv", COLUMNS)
-    for row in rows[:kept]:
-        interrupted.write(row)
-    position = interrupted.position()
-    for row in rows[kept:]:
-        interrupted.write({**row, "task": "lost"})
-    with CsvFile(tmp_path / "resumed.csv", COLUMNS) as resumed:
-        resumed.truncate_to(position)
-        for row in rows[kept:]:
-            resumed.write(row)
-    assert (tmp_path / "resumed.csv").read_bytes() == (tmp_path / "straight.csv").read_bytes()
 
 
 def test_truncation_within_a_row_is_refused(tmp_path):

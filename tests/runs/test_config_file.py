@@ -94,8 +94,7 @@ class Juggle(nico.NicoTask):
 
 
 @pytest.mark.parametrize(
-    ("modules", "where"),
-    [(None, repr(Juggle.__module__)), ({}, "'a script or notebook'")],
+    ("modules", "where"), [(None, repr(Juggle.__module__)), ({}, "'a script or notebook'")]
 )
 def test_the_module_of_an_unknown_task_is_reported_not_imported(tmp_path, modules, where):
     nico.add_task("juggle", Juggle)

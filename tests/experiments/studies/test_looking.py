@@ -178,14 +178,6 @@ def test_the_command_tests_every_seed_in_every_condition(run_of, tmp_path):
     assert [row[0] for row in lines] == [*nico.PAPER_TASKS, "all"]
 
 
-def test_a_run_without_encoders_is_refused(begin, make_config, shipped, tmp_path, refused):
-    run = tmp_path / "run"
-    with begin(run, make_config("state", "oracle", episodes=4), encoders=None) as trainer:
-        trainer.run()
-    arguments = TrainedArguments(run=run, episodes=1)
-    refused(lambda: looking.looking(arguments), "was trained without encoders", "give its Trainer")
-
-
 def test_a_merged_run_is_tested_by_its_blocks(run_of):
     run = run_of("bgpo")
     assert [loaded.config.seeds for loaded in load_blocks(run)] == [(3, 8)]

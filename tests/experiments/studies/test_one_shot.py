@@ -5,12 +5,12 @@ from itertools import product
 
 import numpy as np
 import one_shot
-import pandas as pd
 import pytest
 import torch
 from one_shot import OneShotArguments
 
 from bgpo_trl import load_run
+from bgpo_trl.analysis.task_inference import majority_task, match_counts
 from bgpo_trl.data.recording import record_demonstrations
 from suites import nico
 from tests.helpers import cells, rows
@@ -34,8 +34,13 @@ def test_every_seed_is_tested_with_every_share_of_every_task(run_of, tmp_path):
     assert (tmp_path / "out" / "one_shot.png").exists()
     origin = json.loads((tmp_path / "out" / "one_shot.json").read_text())
     assert set(origin) == {"commit", "command"}
-    shown = [tuple(row[:2]) for row in cells(printed)[1:]]
-    assert shown == [*product(("all", *TASKS), ("50%", "100%"))]
+    shown = {(task, share): means for task, share, *means in cells(printed)[1:]}
+    assert [*shown] == [*product(("all", *TASKS), ("50%", "100%"))]
+    for (task, share), means in shown.items():
+        of_share = [row for row in found if f"{float(row['share']):.0%}" == share]
+        tested = [row for row in of_share if task in ("all", row["task"])]
+        for name, mean in zip(("success", "task_inference"), means, strict=False):
+            assert mean == f"{np.mean([float(row[name]) for row in tested]):.1%}"
 
 
 def test_cells_of_gwr_are_empty_without_it(run_of, tmp_path):
@@ -62,46 +67,21 @@ def test_policies_are_shown_the_beginning_of_new_demonstrations(run_of, tmp_path
     )
     monkeypatch.undo()
     assert [index for index, _, _ in shown_to] == [0, 1, 0, 1]
-    gwr, seen = policy.algorithm.gwr, policy.bank.seen()
+    gwr = policy.algorithm.gwr
+    task_of_node = majority_task(match_counts(gwr, policy.bank.seen()))
     for share, (_, embedding, task) in zip((0.3, 1.0), shown_to[::2], strict=True):
         assert task.tolist() == [[0, 0], [1, 1], [2, 2]]
         for row in range(6):
             n_frames = round(share * int(shown["length"][row]))
             expected = policy.condition(shown["pixels"][row, :n_frames].numpy()).embedding
             assert torch.allclose(embedding[row // 2, row % 2], expected, atol=1e-5)
-        for index in range(2):
-            weights = gwr.graph(index).weights
-            nearest = [int((weights - phi).norm(dim=-1).argmin()) for phi in seen.embedding]
-            for label in range(3):
-                inferred, activity = [], []
-                for phi in embedding[label]:
-                    distance, node = (weights - phi).norm(dim=-1).min(0)
-                    tasks = seen.task[torch.tensor(nearest) == node].tolist()
-                    majority = max(range(3), key=tasks.count) if tasks else -1
-                    inferred.append(majority == label)
-                    activity.append(float(torch.exp(-0.25 * distance)))  # activity_scale
-                found = table.loc[(share, policy.config.seeds[index], TASKS[label])]
-                expected = np.mean(inferred), np.mean(activity)
-                measured = found["task_inference"], found["activity"]
-                assert measured == pytest.approx(expected, abs=1e-5)
-
-
-def test_means_equal_those_by_hand():
-    names = ["share", "seed", "task", "episodes", "success", "task_inference", "activity"]
-    rows = [
-        (0.5, 0, "a", 4, 0.25, 1.0, 0.5),
-        (0.5, 0, "b", 4, 0.75, 0.0, 0.7),
-        (0.5, 1, "a", 4, 0.0, 0.5, 0.5),
-        (0.5, 1, "b", 4, 0.5, 0.5, 0.5),
-        (1.0, 0, "a", 4, 1.0, 1.0, 1.0),
-        (1.0, 1, "a", 4, 0.5, 1.0, 1.0),
-        (1.0, 0, "b", 4, 1.0, 1.0, 1.0),
-        (1.0, 1, "b", 4, 1.0, 1.0, 1.0),
-    ]
-    means = one_shot.means(pd.DataFrame(rows, columns=names))
-    assert list(means) == ["all", "a", "b"]
-    assert means["all"][0.5] == pytest.approx(np.array([[0.5, 0.5, 0.6], [0.25, 0.5, 0.5]]))
-    assert means["a"][1.0] == pytest.approx(np.array([[1, 1, 1], [0.5, 1, 1]]))
+        for index, seed in enumerate(policy.config.seeds):
+            distance, node = torch.cdist(embedding, gwr.graph(index).weights).min(-1)
+            activity = torch.exp(-0.25 * distance).mean(-1)  # activity_scale
+            inferred = (task_of_node[index][node] == task).float().mean(-1)
+            found = table.loc[(share, seed)].loc[[*TASKS]]
+            assert found["activity"].tolist() == pytest.approx(activity.tolist(), abs=1e-5)
+            assert found["task_inference"].tolist() == pytest.approx(inferred.tolist())
 
 
 @pytest.mark.parametrize(

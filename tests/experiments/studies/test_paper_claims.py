@@ -9,7 +9,7 @@ import pytest
 from paper_claims import ClaimsArguments
 
 from tests.analysis.runs import TASKS
-from tests.helpers import cells
+from tests.helpers import cells, edit
 
 SHARED = {"tasks": [*TASKS], "spread": 0.25, "task_starts": [0, 0, 0], "schedule": "practised"}
 SHARED |= {"held_out": "test", "eval_every": 10, "episodes": 500}
@@ -62,9 +62,8 @@ def test_rows_count_up_to_the_episode_that_all_runs_have_reached(tmp_path, monke
 def test_arms_of_one_algorithm_are_told_apart_by_their_folders(tmp_path):
     for arm, settings in (("slow", {"beta": 0.1}), ("without-bonus", {"beta": 0.0})):
         write(tmp_path, arm, 0, 100, 0.5)
-        config = tmp_path / f"{arm}-0" / "config.json"
         changed = {"name": "slow", "algorithm": settings, "episodes": len(arm)}
-        config.write_text(json.dumps(json.loads(config.read_text()) | changed))
+        edit(tmp_path / f"{arm}-0" / "config.json", **changed)
     runs, reached = paper_claims.runs_of(tmp_path)
     assert [*runs] == ["slow", "without-bonus"]
     assert reached == 100
@@ -90,7 +89,6 @@ def test_a_task_counts_in_the_area_from_when_it_is_presented(tmp_path, monkeypat
 def test_runs_of_other_conditions_are_refused(tmp_path):
     write(tmp_path, "slow", 0, 20, 0.5)
     write(tmp_path, "fast", 0, 20, 0.5)
-    config = tmp_path / "fast-0" / "config.json"
-    config.write_text(json.dumps(json.loads(config.read_text()) | {"spread": 1.0}))
+    edit(tmp_path / "fast-0" / "config.json", spread=1.0)
     with pytest.raises(ValueError, match="differ in spread"):
         paper_claims.paper_claims(ClaimsArguments(tmp_path))
