@@ -186,13 +186,25 @@ def test_joined_groups_stay_joined_when_clustered_anew():
         assert len(groups.numbers) == n_groups
 
 
+@pytest.mark.parametrize(("n_known", "group"), [(25, 0), (15, 2)])
+def test_a_cluster_is_of_a_joined_group_that_solves_it_if_most_of_it_was(n_known, group):
+    groups = BehaviorGroups(4)
+    show(groups, torch.cat([around(place, 40) for place in (0, 1, 2)]))
+    groups.join(0, 1)
+    assert groups.numbers == [0, 2]
+    state = groups.state_dict()
+    state["tried"][:] = state["won"][:] = 1
+    state["group"][80 : 80 + n_known] = 0
+    groups.load_state_dict(state)
+    show(groups, around(2, 40, seed=1))  # clustered anew
+    assert group_of(groups, around(2, 50, seed=2)) == [group]
+
+
 @pytest.mark.parametrize(
-    ("solved", "played", "n_groups"),
-    [(True, 1_000, 1), (False, 1_000, 2), (True, 8, 1), (True, 6, 2)],  # 8: four successes
+    ("every", "played", "n_groups"),
+    [(2, 1_000, 1), (8, 1_000, 2), (2, 8, 1), (2, 6, 2)],  # 8: four successes
 )
-def test_a_part_of_a_joined_group_parts_unless_the_groups_expert_solves_it(
-    solved, played, n_groups
-):
+def test_a_part_of_a_joined_group_parts_unless_the_groups_expert_solves_it(every, played, n_groups):
     """The first of two joined groups falls into halves in time, like a new task beside an old."""
     generator = torch.Generator().manual_seed(0)
 
@@ -206,7 +218,7 @@ def test_a_part_of_a_joined_group_parts_unless_the_groups_expert_solves_it(
     n_upper = 0  # episodes of the upper half, of which the group's expert plays the first
 
     def play(inputs):
-        """All of the group is solved every other time, the upper half perhaps never."""
+        """All of the group is solved every other time, the upper half perhaps less often."""
         nonlocal n_upper
         for number, phi in enumerate(inputs):
             group = int(groups.adapt(phi).group)
@@ -215,7 +227,7 @@ def test_a_part_of_a_joined_group_parts_unless_the_groups_expert_solves_it(
             n_upper += upper
             if upper and n_upper > played:
                 continue
-            success = n_upper % 2 == 0 and solved if upper else number % 4 < 2
+            success = n_upper % every == 0 if upper else number % 4 < 2
             groups.end(group, group, fits=True, success=success)
 
     play(torch.cat([draw(60, halves=4.5), draw(40, place=40.0)]))
