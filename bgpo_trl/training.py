@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -20,6 +21,7 @@ from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.logged_episodes import LoggedEpisodes
+from bgpo_trl.encoders.mismatch import doubt_frames
 from bgpo_trl.encoders.representation import Representation, check_savable
 from bgpo_trl.evaluation import Evaluator
 from bgpo_trl.files.checkpoint import save_checkpoint
@@ -233,6 +235,13 @@ class Trainer:
                 f"let it start at {begun + 1} or later"
             )
 
+    def _compare_frames(self) -> None:
+        """Warn if the simulation's frames seem unlike those that the encoders were trained on."""
+        if self.encoders is not None and self.config.algorithm.state == "latent":
+            frames = torch.from_numpy(self.world.simulation.frames())
+            if doubt := doubt_frames(self.encoders.frame_network, frames):
+                warnings.warn(f"the simulation's {doubt}", stacklevel=3)
+
     def run(self) -> None:
         """Train to the end; return at once if a resumed run is complete.
 
@@ -249,6 +258,7 @@ class Trainer:
             if self.config.offline_updates:
                 self._learn_offline()
             self._state = env.reset()
+            self._compare_frames()
             self.save()  # Rows without a checkpoint could not be resumed.
         state, saved = self._state, time.monotonic()
         episodes = self.world.source.episode  # updated in place

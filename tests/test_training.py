@@ -2,6 +2,7 @@
 
 import itertools
 import signal
+import warnings
 from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
@@ -13,11 +14,12 @@ from bgpo_trl import training
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.runs.cost import n_bytes
 from bgpo_trl.runs.results import read_table
-from bgpo_trl.scenes.nico import NicoEnv
+from bgpo_trl.scenes.nico import NicoEnv, NicoSimulation
 from bgpo_trl.training import Trainer
 from tests.algorithms.playing import assert_same
 from tests.conftest import of_name
@@ -468,3 +470,21 @@ def test_a_failure_to_write_the_bank_closes_the_run(begin, tmp_path, monkeypatch
         begin(tmp_path / "run")
     assert sorted(path.name for path in closed) == ["eval.csv", "train.csv"]
     assert not (tmp_path / "run" / "lock").exists()
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_frames_unlike_those_that_the_encoders_know_are_warned_of(
+    begin, make_config, tmp_path, monkeypatch, turned
+):
+    encoders, bank = load_pretrained()
+    if turned:
+        frame = NicoSimulation.frame
+        monkeypatch.setattr(NicoSimulation, "frame", lambda self: frame(self)[..., ::-1])
+    config = make_config(episodes=2, task_starts=(0, 0, 0))
+    with (
+        warnings.catch_warnings(record=True) as caught,
+        begin(tmp_path, config, encoders=encoders, bank=bank) as trainer,
+    ):
+        trainer.run()
+    known = "the simulation's frames fit the encoders better with red and blue exchanged: "
+    assert [str(one.message).startswith(known) for one in caught] == [True] * turned
