@@ -228,6 +228,12 @@ class TrainedPolicy:
                 f"this policy reads {size} joints, finite numbers, beside the frame, got {found}: "
                 "act(frame, joints)"
             )
+        if self._joints.far(readings):
+            warnings.warn(
+                "joints are farther from the scene's center than in any demonstration: in another "
+                "unit?",
+                stacklevel=4,  # of the call before no_grad's
+            )
         return [torch.tensor(readings, dtype=torch.float32)]
 
     def _action(self, frame: Tensor, joints: Tensor | None = None) -> Tensor:

@@ -199,7 +199,6 @@ NUMBERS = ("action", "state", "joints")
 """Entries of an episode, beside its frames, that may be known."""
 _KEYS = ("pixels", *NUMBERS)
 _IDLE = 5  # steps; shorter ones may be part of a task
-_FAR = 20  # scales, by which degrees for radians are found
 
 
 def write_demonstrations(
@@ -392,10 +391,9 @@ def _doubts(scene: Scene, episode: Mapping[str, Any], known: set[bytes]) -> Iter
     for end, still in ("begin", repeated), ("end", repeated[::-1]):
         if still[:_IDLE].all() and not still.all():
             yield f"{end} with {_IDLE} or more steps that change nothing: cut them off"
-    if scene.joints is not None and "joints" in episode:
-        apart = np.abs(np.asarray(episode["joints"]) - scene.joints.center)
-        if (apart > _FAR * np.asarray(scene.joints.scale)).any():
-            yield f"have joints farther than {_FAR} scales from their center: in another unit?"
+    joints = scene.joints if "joints" in episode else None
+    if joints is not None and joints.far(np.asarray(episode["joints"])):
+        yield "have joints farther than 20 scales from their center: in another unit?"
 
 
 def _check_episode(scene: Scene, episode: Mapping[str, Any]) -> int:

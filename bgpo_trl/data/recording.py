@@ -133,6 +133,13 @@ def record_demonstrations(
     recorder = _Recorder(scene, env.simulations[0], seed, attempts)
     _record_rows(dataset, recorder, wanted, progress)
     env.close()
+    for task, tried in recorder.tried.items():
+        if 2 * (succeeded := recorder.succeeded[task]) < tried:
+            warnings.warn(
+                f"the demonstrator of {task!r} succeeded in {succeeded} of {tried} attempts: what "
+                "is recorded are the starts that it can do",
+                stacklevel=2,
+            )
     write_json(path / META, {**wanted, "checksum": checksum_of(dataset)})
     return dataset
 

@@ -35,7 +35,7 @@ from bgpo_trl.training import Trainer
 
 # Number of the evaluation after training; it seeds start states that training never tested.
 _LAST = 2**31
-_SELDOM = 0.5
+_SELDOM = 0.75
 
 
 def measure(
@@ -171,9 +171,12 @@ def success_lines(run: Run) -> list[str]:
     success, steps = (final_means(run, "held-out", column) for column in ("success", "steps"))
     if success is None:
         return []
+    assert run.final is not None
+    tests = run.final[run.final["demonstrations"] == "held-out"]
+    n_tests = tests.groupby("task")["episodes"].sum()
     shown, lines = run.summary["demonstrated_steps"], list[str]()
     for index, task in enumerate(run.tasks):
-        line = f"{task}: {success[:, index].mean():.0%} of held-out tests succeed"
+        line = f"{task}: {success[:, index].mean():.0%} of {n_tests[task]} held-out tests succeed"
         if steps is not None and not np.isnan(steps[:, index]).all():
             line += f", in {np.nanmean(steps[:, index]):.1f} steps"
             line += f" (demonstrated in {shown[task]:.1f})" if task in shown else ""

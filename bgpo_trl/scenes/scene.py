@@ -195,6 +195,13 @@ class StateColumns:
         """Number of columns."""
         return len(self.center)
 
+    def far(self, readings: NDArray[Any]) -> bool:
+        """Return whether a value of ``[..., N]`` is too far off for its unit, as degrees would be.
+
+        That is farther than 20 scales from its center.
+        """
+        return bool((np.abs(readings - np.array(self.center)) > 20 * np.array(self.scale)).any())
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:

@@ -10,6 +10,7 @@ from bgpo_trl.experiments.arguments import RecordArguments
 from bgpo_trl.experiments.make_data import record
 from suites import nico
 from tests.helpers import contents
+from tests.scenes.dot import demonstrate, scene
 
 TINY = {"per_task": 3, "held_out_per_task": 1, "progress": False}
 KEYS = {"pixels", "state", "joints", "action", "length", "task", "train", "seed"}
@@ -103,6 +104,18 @@ def test_a_demonstrator_that_never_succeeds_is_told_of(tmp_path, monkeypatch):
     mended = record_demonstrations(tmp_path, attempts=50, progress=False, **options)
     assert (mended["length"] > 0).all()
     assert mended["length"][:6].equal(before[:6])
+
+
+def test_a_demonstrator_that_seldom_succeeds_is_told_of(tmp_path):
+    def seldom(simulation, task, seed):
+        act = demonstrate(simulation, task, seed)
+        return act if seed % 8 == 0 or task == "right" else lambda: 0 * act()
+
+    options = {"per_task": 6, "held_out_per_task": 1, "progress": False}
+    with pytest.warns(UserWarning) as warned:
+        record_demonstrations(tmp_path, scene=scene(demonstrator=seldom), **options)
+    (told,) = [str(line.message) for line in warned]
+    assert re.match(r"the demonstrator of 'left' succeeded in 6 of \d\d attempts: ", told)
 
 
 def test_an_interrupted_recording_ends_as_an_uninterrupted_one(recorded, tmp_path, monkeypatch):

@@ -149,6 +149,9 @@ def test_policies_and_critics_depend_on_joints(made, dot, tmp_path, refused):
     for joints, found in ((None, "nothing"), ([0.5], r"float64 \[1\]"), ([np.nan, 1.0], "float64")):
         with pytest.raises(ValueError, match=f"this policy reads 2 joints, .* got {found}"):
             policy.act(frame, joints)
+    with pytest.warns(UserWarning, match="joints are farther .*: in another unit") as warned:
+        policy.act(frame, np.degrees([0.5, 11.0]))
+    assert warned[0].filename == __file__
 
     policy.export(tmp_path / "policy.pt2")
     act = torch.export.load(tmp_path / "policy.pt2").module()
