@@ -106,7 +106,7 @@ def test_a_task_and_an_algorithm_of_a_module_are_trained_reported_filmed_and_tes
         watch(WatchArguments(run))
     import_plugin("mine_at_once")
     learned, *outcomes = watch(WatchArguments(run)).splitlines()
-    assert learned == "seed 3 after 4 training episodes"
+    assert learned == "seed 3 after 4 of 4 episodes"
     assert outcomes == ["at_once: success after 1 steps", f"pictures: {run / 'figures'}"]
 
     one_shot(OneShotArguments(run=run, shares=(1.0,), episodes=2))
