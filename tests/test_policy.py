@@ -215,7 +215,11 @@ def test_an_onnx_model_that_acts_otherwise_is_not_written(load, tmp_path, monkey
     policy.condition(DEMONSTRATIONS[1])
     monkeypatch.setattr("bgpo_trl.policy._check_onnx", lambda: None)
     monkeypatch.setattr("bgpo_trl.policy._onnx_model", lambda program, about: b"")
-    monkeypatch.setattr("bgpo_trl.policy._onnx_actions", lambda model: lambda frame: torch.ones(4))
+
+    def actions(model):
+        return lambda frame: torch.from_numpy(policy.act(frame.numpy())) + 1e-3
+
+    monkeypatch.setattr("bgpo_trl.policy._onnx_actions", actions)
     with pytest.raises(RuntimeError, match="acts otherwise"):
         policy.export(tmp_path / "policy.onnx")
     assert not [*tmp_path.glob("*.onnx")]

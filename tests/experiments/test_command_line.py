@@ -169,6 +169,19 @@ def test_an_interrupted_run_exits_with_the_status_for_another_try(capsys, number
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
+def test_warnings_of_the_package_are_one_line_and_those_of_others_as_usual():
+    told = []
+
+    def doubtful(arguments: Arguments):
+        for place in (bgpo.__file__, torch.__file__):
+            told.append(warnings.formatwarning("look", UserWarning, place, 1, line="code"))
+
+    usual = warnings.formatwarning
+    command_line(doubtful, [])
+    assert told == ["warning: look\n", usual("look", UserWarning, torch.__file__, 1, line="code")]
+    assert warnings.formatwarning is usual
+
+
 def test_other_commands_that_are_interrupted_say_whether_they_continue():
     def record(arguments: RecordArguments):
         raise KeyboardInterrupt
