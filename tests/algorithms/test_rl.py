@@ -69,6 +69,22 @@ def test_each_expert_learns_as_it_would_alone_whatever_the_others_see(name):
 
 
 @every_kind
+def test_new_places_are_copies_of_the_first_expert_without_moments(name):
+    learner = make(name, experts=(0, 1))
+    learner.learn(make_batch(2, 2, 16))
+    before = [[learner.read(seed, slot) for slot in (0, 1)] for seed in (0, 1)]
+    learner.resize(3)
+    for seed, experts in enumerate(before):
+        for slot, expected in enumerate([*experts, {**experts[0], "moments": None}]):
+            found = learner.read(seed, slot)
+            if expected["moments"] is None:
+                expected["moments"] = {k: 0 * value for k, value in found["moments"].items()}
+            torch.testing.assert_close(found, expected, rtol=0, atol=0)
+    learner.resize(1)
+    torch.testing.assert_close(learner.read(1, 0), before[1][0], rtol=0, atol=0)
+
+
+@every_kind
 def test_an_expert_without_data_stays_as_it_is(name):
     learner = make(name, experts=(0, 1))
     before, slow = weights(learner), targets(learner)
