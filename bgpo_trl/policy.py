@@ -230,8 +230,7 @@ class TrainedPolicy:
             )
         if self._joints.far(readings):
             warnings.warn(
-                "joints are farther from the scene's center than in any demonstration: in another "
-                "unit?",
+                "joints are farther from the scene's center than its unit allows: in another unit?",
                 stacklevel=4,  # of the call before no_grad's
             )
         return [torch.tensor(readings, dtype=torch.float32)]

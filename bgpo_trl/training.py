@@ -108,8 +108,8 @@ class Trainer:
         used = None if encoders is None else encoders.identity
         if None not in (used, bank.encoder_id) and used != bank.encoder_id:
             raise ValueError(
-                f"the bank was embedded by the encoders {bank.encoder_id}, these are "
-                f"{used}: load both together (load_pretrained), or embed anew "
+                f"the bank was embedded by the encoders {str(bank.encoder_id)[:12]}, these are "
+                f"{str(used)[:12]}: load both together (load_pretrained), or embed anew "
                 "(`bgpo bank`)"
             )
         self._scene = find_scene(config.scene)

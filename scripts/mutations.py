@@ -1,10 +1,11 @@
-"""What the tests catch: one small mistake at a time is made in the package, and tests are run.
+"""Make one small mistake at a time in the package, and see whether its tests catch it.
 
 A mistake is drawn at random from all places where the code can be altered: another comparison,
 sign, number or truth value, a negated condition, a statement or an argument left out, None
 returned. Folders have mistakes in proportion to their places. The tests that reach the mistaken
 line are run, at first those that coverage names, then the whole of their files. A mistake that none
-of them notices has survived; it may be one that changes nothing, so survivors have to be read.
+of them notices has survived; it may be one that changes nothing, so survivors have to be read. A
+test that also fails without the mistake has caught nothing, and is named.
 
 The checkout is altered while it runs: use a clone. Coverage is measured first:
 
@@ -23,12 +24,12 @@ import os
 import random
 import signal
 import sys
-import time
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 PACKAGE = Path("bgpo_trl")
 _OTHER: dict[type[ast.AST], type[ast.AST]] = {
@@ -155,42 +156,60 @@ def sample(number: int, seed: int) -> list[Mutation]:
 
 
 def reaching_tests(mutation: Mutation) -> list[str]:
-    """Return the tests that run a line of the mistake; of a line that none runs, no test."""
+    """Return the tests that run a line of the mistake, those of its own folder first."""
     from coverage import CoverageData
 
     data = CoverageData()
     data.read()
     contexts = data.contexts_by_lineno(str(mutation.path.resolve()))
-    names = {name.split("|")[0] for line in mutation.lines for name in contexts.get(line, [])}
+    names = {name for line in mutation.lines for name in contexts.get(line, [])}
     if "" in names:  # run on import
-        names |= {name.split("|")[0] for many in contexts.values() for name in many}
-    folder = f"tests/{mutation.path.parent.name}/"
-    return sorted(
-        names - {""}, key=lambda name: (not name.startswith(folder), name)
-    )  # its own first
+        names |= {name for many in contexts.values() for name in many}
+    tests = {name.rpartition("|")[0] for name in names} - {""}  # without "|setup", "|run"
+    own = f"tests/{mutation.path.parent.name}/"
+    return sorted(tests, key=lambda test: (not test.startswith(own), test))
 
 
-def passes(tests: list[str]) -> bool | None:
-    """Run tests in a process of its own: whether they pass, or None after the time limit."""
+class FirstFailure:
+    """A pytest plugin that writes the name of the first failure to a pipe."""
+
+    def __init__(self, pipe: int) -> None:
+        self.pipe = pipe
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        """Note a test, or its fixture, that fails."""
+        if report.failed:
+            os.write(self.pipe, report.nodeid.encode() + b"\n")
+
+    pytest_collectreport = pytest_runtest_logreport
+
+
+def failing(tests: list[str]) -> list[str]:
+    """Run tests in a process of its own; return the first that fails, or none.
+
+    All are returned if none could be run, or the time was over.
+    """
+    import pytest
+
+    reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
         os.setsid()
-        import pytest
-
         with open(os.devnull, "w") as nothing:
             os.dup2(nothing.fileno(), 1)
             os.dup2(nothing.fileno(), 2)
-            os._exit(int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *tests]) != 0))
-    deadline = time.monotonic() + _TIMEOUT
-    while time.monotonic() < deadline:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            return status == 0
-        time.sleep(0.1)
+        signal.alarm(_TIMEOUT)
+        options = ["-x", "-q", "-p", "no:cacheprovider", *tests]
+        os._exit(int(pytest.main(options, plugins=[FirstFailure(writer)])))
+    os.close(writer)
+    _, status = os.waitpid(child, 0)
     with contextlib.suppress(ProcessLookupError):
-        os.killpg(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    return None
+        os.killpg(child, signal.SIGKILL)  # what the tests have started
+    with open(reader) as pipe:
+        first = pipe.readline().strip()
+    if status == 0:
+        return []
+    return [first] if first else tests
 
 
 def verdict(mutation: Mutation) -> str:
@@ -198,16 +217,16 @@ def verdict(mutation: Mutation) -> str:
     tests = reaching_tests(mutation)
     if not tests:
         return "not run"
+    files = list(dict.fromkeys(test.partition("::")[0] for test in tests))
     source = mutation.path.read_text()
     mutation.path.write_text(mutation.applied(source))
     try:
-        for chosen in (tests, list(dict.fromkeys(test.split("::")[0] for test in tests))):
-            passed = passes(chosen)
-            if not passed:
-                return "caught" if passed is False else "caught, time limit"
+        failed = failing(tests) or failing(files)
     finally:
         mutation.path.write_text(source)
-    return "survived"
+    if failed and (without := failing(failed)):
+        return f"{without[0]} fails without it"
+    return "caught" if failed else "survived"
 
 
 def main() -> None:

@@ -2,7 +2,11 @@
 
 import ast
 import runpy
+import subprocess
+import sys
 from pathlib import Path
+
+import pytest
 
 SCRIPT = runpy.run_path(str(Path(__file__).parents[1] / "scripts" / "mutations.py"))
 
@@ -35,6 +39,24 @@ def test_each_mistake_alters_one_place_and_leaves_annotations_and_messages_alone
             "return (x)",
         ]
     )
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [(["good"], []), (["good", "bad", "worse"], ["bad"]), (["good", "unknown"], None)],
+)
+def test_the_first_failure_of_some_tests_is_found(tmp_path, names, expected):
+    """Tests that cannot be run are all named, so that nothing passes for caught by them."""
+    script, code = Path(SCRIPT["__file__"]), "import runpy, sys\n"
+    (tmp_path / "test_it.py").write_text(
+        "def test_good(): pass\ndef test_bad(): assert False\ndef test_worse(): assert False\n"
+    )
+    code += f"script = runpy.run_path({str(script)!r})\nprint(script['failing'](sys.argv[1:]))"
+    tests = [f"test_it.py::test_{name}" for name in names]
+    command = [sys.executable, "-c", code, *tests]
+    told = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    found = tests if expected is None else [f"test_it.py::test_{name}" for name in expected]
+    assert ast.literal_eval(told) == found
 
 
 def test_all_mistakes_in_the_package_can_be_read_and_its_folders_have_their_share():

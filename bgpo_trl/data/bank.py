@@ -330,8 +330,8 @@ class DemonstrationBank:
             raise ValueError(f"{path} is damaged or not a bank ({error}); {remedy}") from None
         if meta.get("encoder_id") != encoder_id:
             raise ValueError(
-                f"{path} was embedded by the encoders {str(meta.get('encoder_id'))[:12]}..., not "
-                f"by {encoder_id[:12]}...; {remedy}"
+                f"{path} was embedded by the encoders {str(meta.get('encoder_id'))[:12]}, not by "
+                f"{encoder_id[:12]}; {remedy}"
             )
         return bank
 

@@ -393,7 +393,7 @@ def _doubts(scene: Scene, episode: Mapping[str, Any], known: set[bytes]) -> Iter
             yield f"{end} with {_IDLE} or more steps that change nothing: cut them off"
     joints = scene.joints if "joints" in episode else None
     if joints is not None and joints.far(np.asarray(episode["joints"])):
-        yield "have joints farther than 20 scales from their center: in another unit?"
+        yield "have joints farther from the scene's center than its unit allows: in another unit?"
 
 
 def _check_episode(scene: Scene, episode: Mapping[str, Any]) -> int:
