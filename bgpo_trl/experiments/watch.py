@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -175,7 +176,7 @@ def one_shot(arguments: OneShotArguments) -> str:
         seen.append(policy.preprocess(frame, color="rgb", crop=arguments.crop))
         size = f"{frame.shape[0]} x {frame.shape[1]}"
     frames, lines = np.stack(seen), [f"{len(seen)} frames of {size}"]
-    lines += _recognized(policy.condition(frames, task=arguments.task))
+    lines += _recognized(policy, policy.condition(frames, task=arguments.task))
     if arguments.task is None:
         return "\n".join([*lines, "--task NAME plays it in the simulation"])
     find_scene(policy.config.scene).check_tasks([arguments.task])
@@ -183,11 +184,21 @@ def one_shot(arguments: OneShotArguments) -> str:
     return "\n".join([*lines, f"{arguments.task}: {episode.outcome}"])
 
 
-def _recognized(found: Recognition) -> list[str]:
+def _recognized(policy: TrainedPolicy, found: Recognition) -> list[str]:
     lines = []
     if found.node is not None:
         lines.append(f"behavior: node {found.node} of GWR-B, activity {found.activity:.2f}")
     if found.group is not None:
         novel = "within the group" if found.known else "unlike what the group was shown"
         lines.append(f"group {found.group}, novelty {found.group_novelty:.2f}: {novel}")
+        lines.append(f"labels of the group, which the policy never reads: {_labels(policy, found)}")
     return lines or ["the algorithm has neither GWR-B nor groups: nothing is inferred"]
+
+
+def _labels(policy: TrainedPolicy, found: Recognition) -> str:
+    """Return the labels of a group's demonstrations in the run's bank, the commonest first."""
+    groups = policy.algorithm.groups[policy.config.seeds.index(policy.seed)]
+    own = groups.lookup(policy.bank.embedding).group == found.group
+    counts = Counter(policy.bank.tasks[task] for task in policy.bank.task[own].tolist())
+    shares = (f"{task} {n / counts.total():.0%}" for task, n in counts.most_common())
+    return ", ".join(shares) or "none"

@@ -1,5 +1,7 @@
 """`bgpo one-shot`: a film is read exactly or refused; what it prints is what the policy infers."""
 
+from collections import Counter
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -28,10 +30,20 @@ def test_it_prints_what_the_policy_infers_and_plays_a_task(run_of, film):
     run = run_of("bgpo")
     policy = bgpo_trl.load_run(run)
     found = policy.condition(policy.preprocess(FRAMES, color="rgb"))
-    told, node, group, hint = one_shot(OneShotArguments(run=run, demonstration=film)).splitlines()
+    told, node, group, labels, hint = one_shot(
+        OneShotArguments(run=run, demonstration=film)
+    ).splitlines()
     assert told == "11 frames of 64 x 128"
     assert node == f"behavior: node {found.node} of GWR-B, activity {found.activity:.2f}"
     assert group.startswith(f"group {found.group}, novelty {found.group_novelty:.2f}: ")
+    lookup = policy.algorithm.groups[0].lookup
+    own = [
+        policy.tasks[task]
+        for phi, task in zip(policy.bank.embedding, policy.bank.task, strict=True)
+        if lookup(phi).group == found.group
+    ]
+    shares = ", ".join(f"{task} {n / len(own):.0%}" for task, n in Counter(own).most_common())
+    assert labels == f"labels of the group, which the policy never reads: {shares}"
     assert hint == "--task NAME plays it in the simulation"
 
     task = policy.tasks[1]
