@@ -29,9 +29,9 @@ from bgpo_trl.data.dataset import resize_frames
 from bgpo_trl.encoders.mismatch import doubt_frames
 from bgpo_trl.encoders.representation import Representation, embed_demonstrations
 from bgpo_trl.files.writing import make_folder, write_whole
-from bgpo_trl.runs.config_file import read_config
+from bgpo_trl.runs.config_file import read_config, settings_of
 from bgpo_trl.runs.demonstrations import load_inputs
-from bgpo_trl.runs.directory import fitting_checkpoint, read_checkpoint
+from bgpo_trl.runs.directory import differing_settings, fitting_checkpoint, read_checkpoint
 from bgpo_trl.runs.results import read_json
 from bgpo_trl.scenes import find_scene
 from bgpo_trl.seeding import stream_seed
@@ -453,8 +453,16 @@ def load_all_seeds(path: str | Path, *, make: Callable[..., Algorithm] | None = 
         )
     make = entry(config.name).make if make is None else make
     encoders, bank = load_inputs(path, config.tasks, digests, config.scene)
+    stored = read_json(path / "config.json")
+    compared = differing_settings(stored, settings_of(config, digests))
+    if absent := [name for name, found, _ in compared if found == "absent"]:
+        warnings.warn(
+            f"{path} was made before there was a setting {', '.join(absent)}: today's default is "
+            "used; if the policy does worse than it did, use the version of the run",
+            stacklevel=3,
+        )
     # Compared before anything is made of the sizes in the settings, which may not be the run's.
-    saved = read_checkpoint(path, read_json(path / "config.json"), mmap=True, newest=True)
+    saved = read_checkpoint(path, stored, mmap=True, newest=True)
     with fitting_checkpoint(path):
         state, episodes = saved["algorithm"], saved["world"]["source"]["episode"].tolist()
         return LoadedRun.restore(make, config, state, encoders, bank, episodes)

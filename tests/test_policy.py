@@ -14,10 +14,12 @@ import pytest
 import torch
 
 import bgpo_trl
+from bgpo_trl import training
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.representation import save_representation
+from bgpo_trl.runs.config_file import settings_of
 from bgpo_trl.scenes.nico import NICO
 from bgpo_trl.training import Trainer
 from suites import nico
@@ -324,6 +326,19 @@ def test_a_run_that_cannot_be_loaded_is_refused(trainer_of, tmp_path, refused, d
     shutil.copytree(trainer_of("bgpo").directory, run)
     damage(run)
     refused(lambda: bgpo_trl.load_run(run), cause, "")
+
+
+def test_settings_of_today_that_an_older_run_lacks_are_warned_of(begin, tmp_path, monkeypatch):
+    def older(*arguments):
+        settings = settings_of(*arguments)
+        del settings["algorithm"]["joints"], settings["algorithm"]["rl"]["caution"]
+        return settings
+
+    monkeypatch.setattr(training, "settings_of", older)
+    finish(begin(tmp_path / "run"))
+    with pytest.warns(UserWarning, match="made before there was") as caught:
+        bgpo_trl.load_run(tmp_path / "run")
+    assert "a setting algorithm.joints, algorithm.rl.caution: " in str(caught[0].message)
 
 
 def test_a_run_on_the_ground_truth_watches_nothing(
