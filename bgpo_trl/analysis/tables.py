@@ -266,7 +266,7 @@ def _numbers(values: Iterable[float], digits: int = 0) -> str:
 
 def markdown(rows: Table) -> str:
     """Format a table in Markdown; columns of numbers are aligned on the right."""
-    head, *body = rows
+    head, *body = ([cell.replace("|", r"\|") for cell in row] for row in rows)
     numbers = [
         all(cell[:1] in "+-0123456789" for cell in cells) for cells in zip(*body, strict=True)
     ]

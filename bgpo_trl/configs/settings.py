@@ -62,10 +62,8 @@ def _plain(hint: Any, value: Any) -> Any:
         if isinstance(value, number) and not isinstance(value, bool):
             return hint(value)
         found = False
-    elif hint is bool or hint is str:
+    elif isinstance(hint, type) and (hint in (bool, str) or is_dataclass(hint)):
         found = isinstance(value, hint)
-    elif is_dataclass(hint):
-        found = is_dataclass(value)
     else:
         raise NotImplementedError
     if not found:

@@ -15,7 +15,7 @@ from bgpo_trl.configs.runs import check_seeds
 from bgpo_trl.experiments.arguments import SETTINGS, Arguments
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.directory import differing_settings
-from bgpo_trl.scenes import Scene, find_scene
+from bgpo_trl.scenes import SCENES, Scene, find_scene
 
 
 def run_config(
@@ -66,7 +66,15 @@ def _begin(arguments: Arguments) -> RunConfig:
     path = path / "config.json" if path.is_dir() else path
     if not path.exists():
         raise ValueError(f"--config: there is no file {path}: name one, or a run directory")
-    return read_config(path, defaults=preset)[0]
+
+    def usual(name: Any, scene: Any) -> RunConfig:
+        name = name if isinstance(name, str) and name in ALGORITHMS else preset.name
+        config = replace(preset, name=name, algorithm=ALGORITHMS[name].config)
+        scene = arguments.scene if scene is None else scene
+        known = isinstance(scene, str) and scene in SCENES and scene != config.scene
+        return _in_scene(config, find_scene(scene)) if known else config
+
+    return read_config(path, usual)[0]
 
 
 def named_directory(arguments: Arguments) -> Path | None:

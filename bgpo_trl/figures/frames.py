@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -19,13 +20,17 @@ from bgpo_trl.files.writing import make_folder, write_whole
 def file_names(tasks: Sequence[str]) -> list[str]:
     """Return a name for a file of each task: its own, if no sign or length of it is a problem.
 
+    Names that differ in case alone are one file on some disks; film.gif is that of `bgpo watch`.
+
     Examples:
-        >>> file_names(["grasp_glass", "put a/b, then c", "put a/b: then c"])
-        ['grasp_glass', 'put_a_b_then_c.1', 'put_a_b_then_c.2']
+        >>> file_names(["grasp_glass", "put a/b, then c", "put a/b: then c", "Left", "left"])
+        ['grasp_glass', 'put_a_b_then_c.1', 'put_a_b_then_c.2', 'Left.3', 'left.4']
     """
     plain = [re.sub(r"[^\w-]+", "_", name)[:60] for name in tasks]
+    taken = Counter(["film", *(name.lower() for name in tasks)])
     return [
-        name if name == short else f"{short}.{number}"  # no task's own name, which has no dot
+        # A task's own name has no dot.
+        name if name == short and taken[name.lower()] == 1 else f"{short}.{number}"
         for number, (name, short) in enumerate(zip(tasks, plain, strict=True))
     ]
 
@@ -53,7 +58,9 @@ def plot_frame_strips(episodes: Mapping[str, NDArray], n_frames: int = 8) -> Fig
         label = row[0].annotate(
             title, (0, 1), xytext=(0, 11), xycoords="axes fraction", textcoords="offset points"
         )
-        label.set(fontsize=7, in_layout=False)  # A long title must not widen its column.
+        label.set(
+            fontsize=7, in_layout=False, parse_math=False
+        )  # A long title must not widen its column.
     return figure
 
 

@@ -104,5 +104,5 @@ def task_markers(tasks: Sequence[str]) -> list[tuple[int, str, str, str]]:
 
 
 def readable(name: str) -> str:
-    """Return a task's name in words."""
-    return name.replace("_", " ")
+    """Return a task's name in words, for a label: Matplotlib sets what is between dollars."""
+    return name.replace("_", " ").replace("$", r"\$")

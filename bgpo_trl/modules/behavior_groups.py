@@ -58,9 +58,9 @@ class BehaviorGroups:
     apart may be the small ones.
 
     1. A demonstration that is shown again, or differs from an earlier one by no more than rounding
-       (a ten-thousandth of its length), adds nothing. With every ``smallest`` new ones (beyond
-       ``100 * smallest``: with every hundredth part more), all are clustered anew; until the first
-       time, all are of group 0.
+       (a ten-thousandth of its length, so inputs have to lie around 0), adds nothing. With every
+       ``smallest`` new ones (beyond ``100 * smallest``: with every hundredth part more), all are
+       clustered anew; until the first time, all are of group 0.
     2. An input belongs to the group of the nearest clustered demonstration. Its novelty is the
        distance to the group's ``k``-th nearest, divided by the 99 % quantile of this distance among
        the group's own demonstrations; ``k`` is half the `least_size` of a cluster.

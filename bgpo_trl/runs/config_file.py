@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import re
 import sys
-from dataclasses import asdict, is_dataclass, replace
+from collections.abc import Callable
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_type_hints
 
@@ -31,7 +32,7 @@ class Digests(NamedTuple):
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader, with two rules of YAML 1.2: 1e-4 is a number, and keys are unique."""
+    """PyYAML's safe loader, with rules of YAML 1.2: for numbers (1e-4, 010), and unique keys."""
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
         # Not in construct_mapping, where a mapping also has the keys that it merges (<<).
@@ -43,12 +44,21 @@ class _Loader(yaml.SafeLoader):
                 raise yaml.MarkedYAMLError(problem=given, problem_mark=key.start_mark)
         return node
 
+    def construct_yaml_int(self, node: Any) -> int:
+        return int(self.construct_scalar(node))
 
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"),
-    [*"-+0123456789"],
-)
+
+_INT, _FLOAT = "tag:yaml.org,2002:int", "tag:yaml.org,2002:float"
+_Loader.yaml_implicit_resolvers = {
+    first: [rule for rule in rules if rule[0] not in (_INT, _FLOAT)]
+    for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+for _tag, _number in (
+    (_INT, r"[-+]?[0-9]+$"),
+    (_FLOAT, r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|[-+]?\.(inf|nan)$"),
+):
+    _Loader.add_implicit_resolver(_tag, re.compile(_number), [*"-+.0123456789"])
+_Loader.add_constructor(_INT, _Loader.construct_yaml_int)
 
 
 def _read_settings(path: Path) -> dict[str, Any]:
@@ -69,13 +79,15 @@ def _read_settings(path: Path) -> dict[str, Any]:
     return found
 
 
-def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[RunConfig, Digests]:
+def read_config(
+    path: str | Path, usual: Callable[[Any, Any], RunConfig] | None = None
+) -> tuple[RunConfig, Digests]:
     """Read the settings that `Trainer` wrote: the inverse of ``dataclasses.asdict``.
 
     Args:
         path: The ``config.json`` of a run, or another file of settings, YAML or JSON.
-        defaults: Settings that the file may lack, with the usual ones of the algorithm that the
-            file names; by default, those of the classes.
+        usual: Returns settings that the file may lack, from the algorithm's name and the scene that
+            stand there, or None for either; by default, they are those of the classes.
 
     Returns:
         The settings, and the digests of the encoders and demonstrations.
@@ -86,26 +98,11 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
     """
     path = Path(path)
     settings = _read_settings(path)
-    if defaults is not None:
-        name = settings.get("name", defaults.name)
-        if isinstance(name, str) and name in ALGORITHMS:
-            defaults = replace(defaults, name=name, algorithm=ALGORITHMS[name].config)
-        settings = _merged(_as_json(asdict(defaults)), settings)
+    if usual is not None:
+        given = usual(settings.get("name"), settings.get("scene"))
+        settings = _merged(_as_json(asdict(given)), settings)
     try:
-        digests = Digests(*(settings.pop(name, None) for name in Digests._fields))
-        modules = settings.pop("task_modules", {})
-        settings.pop("scene_version", None)  # `load_last` compares it
-        kind = _algorithm_config(settings.get("name"), settings.pop("algorithm_class", None))
-        scene = settings.get("scene", "nico")
-        if scene not in SCENES:
-            raise LookupError(f"is a run in the scene {scene!r}, which no imported module adds")
-        for task in settings.get("tasks", ()):
-            if task not in find_scene(scene).tasks:
-                # The module is not imported, since a file should not decide what is imported.
-                module = modules.get(task, "a script or notebook")
-                raise LookupError(f"has the task {task!r}, added by {module!r}")
-        algorithm = _built(kind, settings.get("algorithm"), "algorithm")
-        return _built(RunConfig, {**settings, "algorithm": algorithm}), digests
+        return _of_settings(settings)
     except LookupError as error:
         raise ValueError(
             f"{path} {error.args[0]}: name the module that adds it with --import, or import it "
@@ -116,6 +113,30 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
             f"{path} cannot be read ({error}): correct it or, for a run, use the version of the "
             "code that made it"
         ) from error
+
+
+def _of_settings(settings: dict[str, Any]) -> tuple[RunConfig, Digests]:
+    """Return what `settings_of` was given.
+
+    Raises:
+        LookupError: If the scene or a task is unknown to this process.
+        ValueError: If a setting is unknown or out of range; also ``TypeError``, ``AttributeError``.
+    """
+    settings = dict(settings)
+    digests = Digests(*(settings.pop(name, None) for name in Digests._fields))
+    modules = settings.pop("task_modules", {})
+    settings.pop("scene_version", None)  # `load_last` compares it
+    kind = _algorithm_config(settings.get("name"), settings.pop("algorithm_class", None))
+    scene = settings.get("scene", "nico")
+    if scene not in SCENES:
+        raise LookupError(f"is a run in the scene {scene!r}, which no imported module adds")
+    for task in settings.get("tasks", ()):
+        if task not in find_scene(scene).tasks:
+            # The module is not imported, since a file should not decide what is imported.
+            module = modules.get(task, "a script or notebook")
+            raise LookupError(f"has the task {task!r}, added by {module!r}")
+    algorithm = _built(kind, settings.get("algorithm"), "algorithm")
+    return _built(RunConfig, {**settings, "algorithm": algorithm}), digests
 
 
 def read_encoder_settings(path: Path, defaults: RepresentationConfig) -> RepresentationConfig:
@@ -138,6 +159,9 @@ def settings_of(config: RunConfig, digests: Digests) -> dict[str, Any]:
 
     In addition to all settings, it names the class of the hyperparameters, the version of the scene
     and the modules of tasks that are not the paper's.
+
+    Raises:
+        ValueError: If the settings could not be read again, so that the run could not be loaded.
     """
     kind, scene = type(config.algorithm), find_scene(config.scene)
     settings = {
@@ -147,7 +171,17 @@ def settings_of(config: RunConfig, digests: Digests) -> dict[str, Any]:
         "task_modules": dict(scene.modules(config.tasks)),
         **{name: found for name, found in digests._asdict().items() if found or name != "logged"},
     }
-    return _as_json(settings)
+    settings = _as_json(settings)
+    try:
+        same, reason = _of_settings(settings)[0] == config, "others would come back"
+    except (LookupError, ValueError, TypeError, AttributeError) as error:
+        same, reason = False, str(error.args[0])
+    if not same:
+        raise ValueError(
+            f"config.json could not hold these settings ({reason}): add fields to the class of the "
+            "algorithm alone, and define it at the top of a module"
+        )
+    return settings
 
 
 def _as_json(settings: dict[str, Any]) -> dict[str, Any]:

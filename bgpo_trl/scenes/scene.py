@@ -115,10 +115,13 @@ def checked_numbers(
     found = getattr(simulation, method)()
     numbers = np.asarray(found)
     kind, shape = numbers.dtype.kind, numbers.shape
+    if kind in "fiu":
+        with np.errstate(over="ignore"):  # what float32 does not hold is refused below
+            numbers = numbers.astype(np.float32)
     if kind not in "fiu" or shape != (size,) or not np.isfinite(numbers).all():
         wanted = f"{size} finite numbers, as the scene's StateColumns say"
         raise _refusal(simulation, method, short_repr(found), wanted)
-    return numbers.astype(np.float32)
+    return numbers
 
 
 def checked_step(simulation: Simulation, action: NDArray[np.float64]) -> Outcome:
@@ -184,7 +187,9 @@ class StateColumns:
                 f"center has {len(self.center)} columns, scale has {len(self.scale)}: give as many"
             )
         for column, (center, scale) in enumerate(zip(self.center, self.scale, strict=True)):
-            if not (math.isfinite(center) and 0 < scale < math.inf):
+            # Of a constant column, rounding may leave a spread that float32 does not see.
+            seen = np.float32(center) + np.float32(scale) > np.float32(center)
+            if not (math.isfinite(center) and 0 < scale < math.inf and seen):
                 raise ValueError(
                     f"column {column} of the ground truth has the center {center} and the scale "
                     f"{scale}: give finite numbers, the scale above 0, such as 1 for a constant"

@@ -14,7 +14,9 @@ from bgpo_trl.experiments.arguments import Arguments, EncodersArguments
 from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.experiments.settings import run_config
 from bgpo_trl.runs.config_file import Digests, read_encoder_settings, settings_of
+from bgpo_trl.scenes import SCENES
 from suites import nico
+from tests.scenes import dot
 
 ONE, TWO, THREE = nico.PAPER_TASKS
 
@@ -93,6 +95,21 @@ def test_a_file_changes_the_preset_and_flags_change_the_file(tmp_path):
     assert (other.name, other.algorithm) == ("maml", ALGORITHMS["maml"].config)
 
 
+def test_a_file_may_name_the_scene_whose_tasks_and_length_are_then_the_usual_ones(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setitem(SCENES, "dot", dot.scene())
+    path = tmp_path / "mine.yaml"
+    for content, length in (("", 12), ("algorithm: {max_steps: 010}", 10)):  # 8 in YAML 1.1
+        path.write_text(f"scene: dot\n{content}")
+        of_file = run_config(Arguments(config=path))
+        path.write_text(content or "{}")
+        of_flag = run_config(Arguments(config=path, scene="dot"))
+        assert of_file == of_flag
+        assert (of_file.scene, of_file.algorithm.max_steps) == ("dot", length)
+        assert of_file.tasks == SCENES["dot"].default_tasks
+
+
 def test_a_file_sets_what_encoders_train_with_and_flags_change_the_file(tmp_path):
     (path := tmp_path / "mine.yaml").write_text("seed: 3\nvae: {steps: 7, kl_weight: 1e-3}")
     found: list[EncodersArguments] = []
@@ -151,6 +168,11 @@ def test_yaml_json_and_flags_store_the_same_settings(tmp_path):
         ("mine.yaml", "seeds: [0, 1\nepisodes: 5", "line 2"),
         ("mine.yaml", "- seeds", "name: value"),
         ("mine.yaml", "tasks: &all [*all]", "unhashable"),
+        (
+            "mine.yaml",
+            "episodes: 1:30",
+            "episodes must be a whole number, got 1:30",
+        ),  # 90 in YAML 1.1
         ("mine.yaml", "seeds: !!python/tuple [1]", "line 1"),
         ("mine.yaml", "seeds: [0]\nname: x\nseeds: [1]", "line 3 cannot be read ('seeds' is given"),
         ("mine.yml", "algorithm:\n  rl: {beta: 1, beta: 2}", "line 2 cannot be read ('beta' is"),

@@ -4,7 +4,9 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
+from bgpo_trl.analysis.tables import markdown
 from bgpo_trl.figures.frames import plot_frame_strips, save_gif
+from bgpo_trl.figures.style import readable, save_figure
 
 
 def test_strips_show_evenly_spaced_frames():
@@ -35,3 +37,12 @@ def test_a_gif_keeps_frames_and_duration_and_enlarges_them(tmp_path):
             assert shown.shape == (4, 6, 3)
             for row, column in np.ndindex(4, 6):
                 assert (shown[row, column] == frame[row // 2, column // 2]).all()
+
+
+def test_names_of_tasks_are_no_formulas(tmp_path):
+    name = r"use $\frac$ | pay $5 or $6"
+    figure = plot_frame_strips({name: np.zeros((3, 4, 6, 3), np.uint8)})
+    label = figure.text(0.0, 0.0, readable(name))
+    assert label.get_window_extent(FigureCanvasAgg(figure).get_renderer()).width > 0
+    save_figure(figure, tmp_path / "names.png", dpi=50)
+    assert markdown([["task"], [name]]).endswith(r"| use $\frac$ \| pay $5 or $6 |")

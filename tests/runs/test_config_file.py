@@ -6,7 +6,8 @@ from dataclasses import asdict, dataclass, field, replace
 import pytest
 
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.configs import PRESETS, BGPOConfig, GWRBConfig, RunConfig
+from bgpo_trl.configs import PRESETS, BGPOConfig, GWRBConfig, RLConfig, RunConfig
+from bgpo_trl.configs.encoders import VAEConfig
 from bgpo_trl.runs.config_file import Digests, read_config, settings_of
 from suites import nico
 
@@ -52,7 +53,24 @@ class MixedConfig(BGPOConfig):
     rate: int | float = 0.5
 
 
+@dataclass(frozen=True)
+class FadingRL(RLConfig):
+    fade: float = 0.5
+
+
 def test_settings_that_could_not_be_read_are_not_made():
+    @dataclass(frozen=True)
+    class Local(BGPOConfig):
+        extra: int = 1
+
+    for algorithm, cause in (
+        (Local(), "whose hyperparameters"),
+        (BGPOConfig(rl=FadingRL()), "rl.fade"),
+    ):
+        with pytest.raises(ValueError, match=f"could not hold these settings .*{cause}"):
+            settings_of(RunConfig(name="mine", algorithm=algorithm), Digests("abc", "def"))
+    with pytest.raises(ValueError, match="rl must be RLConfig"):
+        BGPOConfig(rl=VAEConfig())  # pyright: ignore[reportArgumentType]
     for kind, name in ((ListConfig, "widths"), (MixedConfig, "rate")):
         with pytest.raises(ValueError, match=f"{name} is annotated .*, which config.json cannot"):
             kind()

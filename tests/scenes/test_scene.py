@@ -280,6 +280,7 @@ RETURNED = [
     ("step", None, "None"),
     ("state", None, "None: return 1 finite numbers"),  # a forgotten return was NaN
     ("state", [np.nan], r"\[nan\]"),
+    ("state", [1e39], r"\[1e\+39\]"),  # inf as float32
     ("state", [0.0, 1.0], r"\[0.0, 1.0\]"),
     ("state", 0.0, "0.0"),
     ("state", ["far"], r"\['far'\]"),
@@ -314,7 +315,9 @@ def test_what_a_simulation_returns_is_checked(tmp_path, method, value, message):
             call()
 
 
-@pytest.mark.parametrize("column", [(0.0, 0.0), (0.0, np.inf), (np.nan, 1.0), (0.0, -1.0)])
+@pytest.mark.parametrize(
+    "column", [(0.0, 0.0), (0.0, np.inf), (np.nan, 1.0), (0.0, -1.0), (0.1, 1.4e-17), (0.0, 1e-46)]
+)
 def test_a_ground_truth_is_divided_by_numbers_above_zero(column):
     """The deviation of a constant column is 0, and policies observed NaN."""
     center, scale = column
