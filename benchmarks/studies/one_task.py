@@ -119,13 +119,13 @@ class Trial:
         return TransformedEnv(simulation, transforms)
 
     @torch.no_grad()
-    def act(self, latent: Tensor, alone: Tensor) -> Tensor:
+    def act(self, latent: Tensor, alone: Tensor, *, averaged: bool = False) -> Tensor:
         """Return actions ``[N, 4]``, those of the clone where it is ``alone`` ``[N]``."""
         first = torch.zeros((), dtype=torch.int64)
         action = torch.empty(len(latent), 4)
         for cloned in alone.unique():
             rows = alone == cloned
-            weights = self.learner.policy_weights(first, first, cloned)
+            weights = self.learner.policy_weights(first, first, cloned, averaged=averaged)
             data = TensorDict({"latent": latent[rows]}, [int(rows.sum())])
             action[rows] = functional_call(self.learner.policy, weights, (data,))["action"]
         return action
@@ -223,7 +223,8 @@ class Trial:
         state, active = env.reset(), torch.ones(n_tests, dtype=torch.bool)
         success, steps = torch.zeros_like(active), torch.zeros(n_tests)
         while active.any():
-            state["action"] = self.act(state["latent"], torch.full([n_tests], alone))
+            alone_in_all = torch.full([n_tests], alone)
+            state["action"] = self.act(state["latent"], alone_in_all, averaged=True)
             state = env.step(state.set("_step", active))["next"]
             steps += active
             success |= state["success"].flatten() & active

@@ -159,8 +159,9 @@ class Experts:
         expert = self.find(seed, group)
         if group in self._inactive[seed]:
             return expert
-        # An entry that is missing becomes 0, so that a new group imitates with the full weight.
-        networks = {k: v for k, v in expert["networks"].items() if k != "n_imitated"}
+        # An entry that is missing becomes 0: a new group imitates with the full weight, and its
+        # averages begin anew.
+        networks = {k: v for k, v in expert["networks"].items() if not k.startswith("n_")}
         return {"networks": networks, "moments": {}}
 
     def find(self, seed: int, group: int) -> Expert:

@@ -24,7 +24,7 @@ __all__ = ["Expert", "Learner", "LearnerSpec", "make_learner"]
 
 
 Expert = dict[str, dict[str, Tensor]]
-"""One expert of a learner: ``networks`` with targets, and ``moments`` of Adam, each by name."""
+"""One expert of a learner, by name: ``networks`` with targets and averages, Adam's ``moments``."""
 
 
 class Learner:
@@ -48,7 +48,11 @@ class Learner:
         self.policy, self.loss, self.config, self.sources = policy, loss, config, sources
         self._prefixes = {f"{source}.": f"{at}." if at else "" for at, source in sources.items()}
         self.target_update = ForeachSoftUpdate(loss, tau=config.tau)
-        learned = [p for p in loss.parameters() if p.requires_grad]
+        read = tuple(self._prefixes) if config.averaging else ("no network",)
+        parameters = [(n, p) for n, p in loss.named_parameters() if p.requires_grad]
+        self.average = {n: p.detach().clone() for n, p in parameters if n.startswith(read)}
+        self.n_averaged = loss.n_imitated.clone()
+        learned = [p for _, p in parameters]
         self.optimizer = torch.optim.Adam(learned, lr=config.learning_rate, fused=True)
 
     @torch.no_grad()
@@ -79,7 +83,12 @@ class Learner:
         return (action.cpu() + noise).clamp(-1.0, 1.0)
 
     def policy_weights(
-        self, seed: Tensor, expert: Tensor, only_clone: Tensor | None = None
+        self,
+        seed: Tensor,
+        expert: Tensor,
+        only_clone: Tensor | None = None,
+        *,
+        averaged: bool = False,
     ) -> dict[str, Tensor]:
         """Copy the weights of the policies ``[*B]`` of experts, by name in `policy`.
 
@@ -87,13 +96,16 @@ class Learner:
             seed: Position of the seed of each policy, int64 ``[*B]``.
             expert: Place of its expert in the stack, int64 ``[*B]``.
             only_clone: Whether its clone acts alone, bool ``[*B]``; by default not.
+            averaged: Whether they are averaged, where they are, for tests (`RLConfig.averaging`).
         """
-        networks = self._of_policy(self._stacked()["networks"])
+        networks = self._of_policy(self._stacked()["networks"], averaged=averaged)
         weights = {name: value[seed, expert] for name, value in networks.items()}
         return self._with_choice(weights, seed.shape, only_clone)
 
-    def _of_policy(self, networks: dict[str, Tensor]) -> dict[str, Tensor]:
+    def _of_policy(self, networks: dict[str, Tensor], *, averaged: bool) -> dict[str, Tensor]:
         """Return the tensors of the loss that the policy uses, by name in `policy`."""
+        if averaged:
+            networks = networks | {n: networks[f"average {n}"] for n in self.average}
         return {
             at + name.removeprefix(source): value
             for name, value in networks.items()
@@ -120,7 +132,23 @@ class Learner:
         torch.stack([part.sum() for part in parts.values()]).sum().backward()
         self.optimizer.step()
         self.target_update.step()
+        if self.average:
+            self._average(batch)
         return {key: value.detach().sum(1) for key, value in parts.items()}
+
+    @torch.no_grad()
+    def _average(self, batch: TensorDictBase) -> None:
+        """Let the averaged weights of the experts that have learned follow the latest ones.
+
+        An update first has ten times its share of all so far, so that the average is of about the
+        last tenth of them; later, it has the share ``averaging``.
+        """
+        learned = self.loss.trains(batch)
+        self.n_averaged += learned
+        share = (10.0 / self.n_averaged).clamp(self.config.averaging, 1.0) * learned
+        latest = dict(self.loss.named_parameters())
+        for name, average in self.average.items():
+            average.lerp_(latest[name], share.reshape(*share.shape, *[1] * (average.ndim - 2)))
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Return the losses ``[S, E]`` to minimize on transitions ``[S, E, B]``.
@@ -147,6 +175,9 @@ class Learner:
         """Return the tensors that have a row for each expert, ``[S, E, ...]``, as in `Expert`."""
         parameters = dict(self.loss.named_parameters())
         named, stack = {**parameters, **dict(self.loss.named_buffers())}, self.loss.batch_size
+        if self.average:
+            named |= {f"average {name}": value for name, value in self.average.items()}
+            named["n_averaged"] = self.n_averaged
         return {
             "networks": {k: v for k, v in named.items() if v.shape[: len(stack)] == stack},
             "moments": {
@@ -193,19 +224,25 @@ class Learner:
         self.loss.batch_size = torch.Size([self.loss.batch_size[0], width])
 
     def expert_weights(self, expert: Expert, only_clone: bool = False) -> dict[str, Tensor]:
-        """Copy the weights of an expert's policy to the CPU, by name in `policy`."""
-        weights = self._of_policy(expert["networks"])
+        """Copy the weights of an expert's policy in tests to the CPU, by name in `policy`."""
+        weights = self._of_policy(expert["networks"], averaged=True)
         copies = {name: value.to("cpu", copy=True) for name, value in weights.items()}
         return self._with_choice(copies, torch.Size(), torch.tensor(only_clone))
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the states of loss (with targets) and optimizer."""
-        return {"loss": dict(self.loss.state_dict()), "optimizer": self.optimizer.state_dict()}
+        """Return the states of loss (with targets), optimizer and averaged weights."""
+        return {
+            "loss": dict(self.loss.state_dict()),
+            "optimizer": self.optimizer.state_dict(),
+            "average": {**self.average, "n_averaged": self.n_averaged},
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a `state_dict`."""
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
+        for name, value in {**self.average, "n_averaged": self.n_averaged}.items():
+            value.copy_(state["average"][name])
 
 
 @dataclass(frozen=True)

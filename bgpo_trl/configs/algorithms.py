@@ -80,6 +80,10 @@ class RLConfig(Settings):
     """Environment steps of each seed per update (1 in Alg. 1)."""
     policy_delay: int = 1
     """Updates of the critics, and of a clone, per update of the actor."""
+    averaging: float = 0.0
+    """Share of the latest weights in the averages with which tests act, or a tenth of the updates
+    so far if they are fewer; 0 to act with the latest weights. Ours: they vary by several points
+    from one test to the next."""
     caution: float = 1.0
     """With both proposals, standard deviations of the critics' gains by which their mean must be
     above 0 for the actor's proposal to be taken (`ProposalPolicy`)."""
@@ -108,6 +112,7 @@ class RLConfig(Settings):
             ("hidden_sizes", sizes, "one or more whole numbers, of at least 1"),
             ("gamma", 0 <= self.gamma <= 1, "between 0 and 1"),
             ("tau", 0 < self.tau <= 1, "above 0 and at most 1"),
+            ("averaging", 0 <= self.averaging <= 1, "between 0 and 1"),
             ("replay_size", self.replay_size >= least, f"{least} (batch, warm-up) or more"),
             ("clone_share", 0 <= self.clone_share < 1, "at least 0 and below 1"),
             ("success_share", 0 <= self.success_share < 1, "at least 0 and below 1"),
@@ -132,6 +137,7 @@ SHOWN = RLConfig(
     noise=0.1,
     update_every=2,
     policy_delay=2,
+    averaging=3e-4,
     clone_share=0.1,
 )
 """Learner from demonstrations and reward. Ours, from `docs/learning.md`."""

@@ -329,7 +329,7 @@ class DDPGLoss(LossModule):
         loss = self.mean_per_seed(self.actor_objective(data), tensordict)
         if self.imitation:
             loss = loss + self.imitation_weight * self.distance("actor_network", tensordict)
-            self.count_imitated(tensordict)
+            self.n_imitated += self.trains(tensordict)
         loss = self.reduce_seeds(loss)
         pre_tanh = data.get(self.tensor_keys.pre_tanh_action, None)
         if pre_tanh is None:
@@ -374,10 +374,12 @@ class DDPGLoss(LossModule):
         halved = self.n_imitated / (self.imitation_half_life or math.inf)
         return self.imitation * 0.5**halved
 
-    def count_imitated(self, tensordict: TensorDictBase) -> None:
-        """Count an update of the actors that have transitions ``[*S, *B]`` of any weight."""
+    def trains(self, tensordict: TensorDictBase) -> Tensor:
+        """Return which networks ``[*S]`` have transitions ``[*S, *B]`` of any weight."""
         weights = tensordict.get(self.tensor_keys.priority_weight, None)
-        self.n_imitated += 1 if weights is None else (self.flatten_batch(weights) > 0).any(-1)
+        if weights is None:
+            return torch.ones_like(self.n_imitated, dtype=torch.bool)
+        return (self.flatten_batch(weights) > 0).any(-1)
 
     def shown(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """Return the policies' input in demonstrated states, and all that is shown, ``[*S, *B]``.

@@ -98,7 +98,7 @@ class MAMLLoss(DDPGLoss):
         adapted = self.adapt(support)
         loss = self.policy_loss(adapted, query)
         self._keep(adapted)
-        self.count_imitated(query)
+        self.n_imitated += self.trains(query)
         return self.reduce_seeds(loss), {}
 
     def adapt(self, tensordict: TensorDictBase) -> Parameters:
