@@ -1,6 +1,7 @@
 """Success and steps of trained policies in many tests, and of the two policies they choose from.
 
     python benchmarks/studies/trained.py runs/continual-bgpo-quick --episodes 200
+    python benchmarks/studies/trained.py ... --latest   # what averaging the weights is worth
 
 Starts and held-out demonstrations depend on the seed and the number of tests alone, so that runs of
 the same seeds and tasks, such as ``bgpo`` and ``clone``, are tested from the same starts.
@@ -9,7 +10,7 @@ the same seeds and tasks, such as ``bgpo`` and ``clone``, are tested from the sa
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from shared import TrainedArguments, load_blocks, write_measurement
 from torch import Tensor
 
+from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.analysis.statistics import mean
 from bgpo_trl.analysis.tables import markdown
 from bgpo_trl.evaluation import Evaluator, Snapshot
@@ -58,6 +60,14 @@ POLICIES: dict[str, Callable[[Weights], Weights]] = {
     "actor alone": _actor,
 }
 """Changes of the weights of a `ProposalPolicy`, by the name of the policy that results."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WeightsArguments(TrainedArguments):
+    """Tests of the policies of a run."""
+
+    latest: bool = False
+    """Test the latest weights, instead of their averages, with which all tests act."""
 
 
 class Row(NamedTuple):
@@ -112,7 +122,7 @@ def _changed(snapshot: Snapshot, change: Callable[[Weights], Weights]) -> Snapsh
     return replace(snapshot, policy=replace(policy, parameters=change(policy.parameters)))
 
 
-def trained(arguments: TrainedArguments) -> str:
+def trained(arguments: WeightsArguments) -> str:
     """Test trained policies often, and the clone, the actor and the critics' choice alone.
 
     Prints a table of success (%) and steps of a success, means over seeds, and in points what the
@@ -128,6 +138,8 @@ def trained(arguments: TrainedArguments) -> str:
     runs, rows = load_blocks(arguments.run), list[Row]()
     check_folder(out)
     for run in runs:
+        if arguments.latest and isinstance(run.algorithm, BGPO):
+            run.algorithm.learner.average.clear()
         steps = len(POLICIES) * (run.config.algorithm.max_steps + 1)
         with progress_bar("trained", total=steps, unit="step") as bar:
             rows += measure_trained(run, arguments.episodes, bar.update)

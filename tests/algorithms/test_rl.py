@@ -85,6 +85,35 @@ def test_new_places_are_copies_of_the_first_expert_without_moments(name):
 
 
 @every_kind
+def test_tests_act_with_averages_of_the_weights_of_updates_with_data(name):
+    """Of about the last tenth of the updates, and at last of the last five."""
+    learner = make(name, experts=(0, 1), averaging=0.2)
+    seed, expert = torch.tensor([[0, 0], [1, 1]]), torch.tensor([[0, 1], [0, 1]])
+    averages = learner.policy_weights(seed, expert)
+    updates, latest = torch.zeros(2, 2), averages
+    for update in range(60):
+        data = make_batch(2, 2, 4, seed=update)
+        with_data = torch.tensor([[1.0, 1.0], [1.0, update % 3 == 0]])
+        given = with_data.unsqueeze(-1).expand(2, 2, 4)
+        data["priority_weight"] = data["imitation", "priority_weight"] = given
+        learner.learn(data)
+        updates += with_data
+        latest = learner.policy_weights(seed, expert)
+        for place in map(tuple, with_data.nonzero().tolist()):
+            share = max(0.2, min(1.0, 10 / updates[place].item()))
+            for key, average in averages.items():
+                if key != "only_clone" and "critic" not in key:
+                    average[place] = average[place].lerp(latest[key][place], share)
+    averages |= {key: value for key, value in latest.items() if "critic" in key}
+    found = learner.policy_weights(seed, expert, averaged=True)
+    torch.testing.assert_close(found, averages)
+    of_one = learner.expert_weights(learner.read(1, 1))
+    torch.testing.assert_close(of_one, {key: value[1, 1] for key, value in found.items()})
+    first = next(iter(found))
+    assert not found[first].allclose(learner.policy_weights(seed, expert)[first])
+
+
+@every_kind
 def test_an_expert_without_data_stays_as_it_is(name):
     learner = make(name, experts=(0, 1))
     before, slow = weights(learner), targets(learner)
