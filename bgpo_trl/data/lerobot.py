@@ -10,7 +10,8 @@ import contextlib
 import importlib.util
 import itertools
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,8 @@ def read_lerobot(
 
     The frames of the chosen episodes are held in memory, in the size of ``frame_shape``. Actions
     must have the meaning of the scene's, in [-1, 1]: scale them, or leave them out. Frames that are
-    stored as video are decoded with PyAV, which is no part of the extra.
+    stored as video are decoded with PyAV, which is no part of the extra. There is a warning if a
+    video goes on after an episode: a frame too many would shift those after it.
 
     Args:
         path: Folder of the LeRobot dataset.
@@ -99,6 +101,8 @@ def read_lerobot(
             f"one of its features as success_key, {', '.join(reader.features)}"
         )
     found = reader.read(chosen, success_key, episodes, tasks, stride, logged)
+    if reader.doubt:
+        warnings.warn(reader.doubt, stacklevel=2)
     if "action" in chosen and stride > 1 and combine is not None:
         for episode in itertools.chain(*found.values()):
             between = episode["action"].reshape(-1, stride, episode["action"].shape[-1])
@@ -164,7 +168,9 @@ class _Reader:
         self.path, self.image_key, self.frame_shape = path, image_key, frame_shape
         self.is_video = self.features[image_key] == "video"
         self._images: tuple[Path | None, Sequence[Any]] = (None, [])
-        self._film_ends: dict[tuple[int, int], float] = {}  # s, by chunk and file
+        self.doubt = ""
+        # Number and end (s) of the last episode of each film, by chunk and file.
+        self._last: dict[tuple[int, int], tuple[int, float]] = {}
         if self.is_video and importlib.util.find_spec("av") is None:
             raise ValueError(
                 f"{path} has its frames as video: pip install av (PyAV) to decode them, or decode "
@@ -297,12 +303,24 @@ class _Reader:
         half = 0.5 / self.fps
         placed = metadata.sort_values([*metadata.columns[2:]])
         for number, length, chunk, file, start in placed.itertuples(index=False):
-            if start < self._film_ends.get((chunk, file), 0.0) - half:
+            last, end = self._last.get((chunk, file), (number, 0.0))
+            if start < end - half:
                 raise ValueError(
                     f"episode {number} of {self.path} begins in another one's frames, at "
                     f"{start:.3f} s of its film by meta/episodes: get it again whole"
                 )
-            self._film_ends[chunk, file] = start + length / self.fps
+            # LeRobot's tools leave no gaps; where others have removed an episode, its number lacks.
+            if start > end + half and number == last + 1:
+                self._doubt_film(last, end, f"the next one begins at {start:.3f} s")
+            self._last[chunk, file] = number, start + length / self.fps
+
+    def _doubt_film(self, number: int, end: float, found: str) -> None:
+        """Note the first episode after whose end (s) its film goes on, and what tells it."""
+        self.doubt = self.doubt or (
+            f"episode {number} of {self.path} ends at {end:.3f} s of its film by its length, "
+            f"{found}: if a frame is in the film twice, those after it do not fit their actions; "
+            "look at them, or record the episode again"
+        )
 
     def _table(self, folder: str, columns: list[str]) -> pd.DataFrame:
         """Return columns of all Parquet files of a folder, with ``file`` and ``row`` in it."""
@@ -356,8 +374,10 @@ class _Reader:
             with _reading(video):
                 if not video.is_file():
                     raise FileNotFoundError
-                end = self._film_ends[chunk, file]
-                yield from _frames_at(video, start + times, 0.5 / self.fps, end)
+                last, end = self._last[chunk, file]
+                seconds = yield from _frames_at(video, start + times, 0.5 / self.fps, end)
+                if seconds > end + 0.5 / self.fps:
+                    self._doubt_film(last, end, f"the film at {seconds:.3f} s")
             return
         yield from alike(self._stored_images(rows), "its images")
 
@@ -399,8 +419,11 @@ def _some(values: Sequence[Any]) -> str:
 
 def _frames_at(
     path: Path, times: NDArray[np.float64], tolerance: float, end: float
-) -> Iterator[NDArray[np.uint8]]:
+) -> Generator[NDArray[np.uint8], None, float]:
     """Decode the frames of a video that are nearest to some times (s), which ascend.
+
+    Returns:
+        When the video ends (s), if it says so.
 
     Raises:
         ValueError: If the nearest frame is farther than the tolerance, or the video ends before
@@ -432,3 +455,4 @@ def _frames_at(
                     "would be taken for those before; get or record it again"
                 )
             yield frame.to_ndarray(format="rgb24")
+    return seconds

@@ -356,7 +356,7 @@ def test_invalid_arguments_are_refused_before_anything_is_written(tmp_path):
     assert not [*tmp_path.iterdir()]
 
 
-GRAYS = np.arange(11) * 20 + 20
+GRAYS = np.arange(12) * 20 + 20
 
 
 def encode(file, kept, pix_fmt, codec):
@@ -430,7 +430,7 @@ def test_frames_of_a_video_are_decoded_from_the_first_of_the_episode(written, fi
 
     read = [found[TASKS[1]][0], found[TASKS[0]][0], found[TASKS[1]][1]]
     shown = np.concatenate([episode["pixels"].mean((1, 2, 3)) for episode in read])
-    np.testing.assert_allclose(shown, GRAYS, atol=6)
+    np.testing.assert_allclose(shown, GRAYS[:11], atol=6)
     every_other = read_lerobot(written, stride=2, combine=lambda a: a[0])[TASKS[1]][0]["pixels"]
     np.testing.assert_allclose(every_other.mean((1, 2, 3)), GRAYS[:5:2], atol=6)
     path.unlink()
@@ -450,6 +450,30 @@ def test_a_video_that_lacks_a_frame_is_refused(written, film, refused, gap, epis
     """Read one after the other, all later frames would be off by one against the actions."""
     film([number for number in range(11) if number != gap])
     refused(lambda: read_lerobot(written), f"episode {episode} of ", cause)
+
+
+@pytest.mark.parametrize(
+    ("starts", "cause"),
+    [
+        ((0.0, 1.0, 1.4), "episode 2 of .* ends at 2.200 s of its film .* the film at 2.400 s"),
+        ((0.0, 1.2, 1.6), "episode 0 of .* ends at 1.000 s .* the next one begins at 1.200 s"),
+    ],
+)
+def test_a_video_with_a_frame_too_many_is_told_once(written, film, starts, cause):
+    film(range(12))
+    replaced(f"videos/{CAMERA}/from_timestamp", starts, EPISODES)(written)
+    with pytest.warns(UserWarning, match=cause) as caught:
+        read_lerobot(written)
+    assert len(caught) == 1
+
+
+def test_a_video_may_show_episodes_that_were_removed(written, film, recwarn):
+    film()
+    without(index=[5, 6])(written)
+    without(EPISODES, index=1)(written)
+    edit_info(total_episodes=2, total_frames=9)(written)
+    assert [len(e["pixels"]) for e in read_lerobot(written)[TASKS[1]]] == [5, 4]
+    assert not recwarn.list
 
 
 def test_episodes_that_overlap_in_a_video_are_refused(written, film, refused):
