@@ -35,8 +35,8 @@ def decode_image(content: bytes) -> NDArray[np.uint8]:
             f"its images are of mode {image.mode}, of more than 8 bits: make them uint8 by a scale "
             "of yours, or choose another camera"
         )
-    if image.has_transparency_data and np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
-        raise UnreadableError("its images are transparent: put them on a background of yours")
+    if image.has_transparency_data:
+        check_opaque(np.asarray(image.convert("RGBA")))
     return np.asarray(image.convert("RGB"))
 
 
@@ -49,6 +49,32 @@ def check_depth(stream: Any) -> None:
     name = stream.format.name
     if name.startswith("gray") and name != "gray":
         raise UnreadableError(f"its frames are {name}, of more than 8 bits, as of a depth map")
+
+
+def decode_frame(frame: Any) -> NDArray[np.uint8]:
+    """Return a frame of PyAV as ``[H, W, 3]``, red first, upright as its camera says.
+
+    Raises:
+        UnreadableError: If it is transparent, or turned by no whole number of quarters.
+    """
+    if any(component.is_alpha for component in frame.format.components):
+        check_opaque(frame.to_ndarray(format="rgba"))
+    pixels = frame.to_ndarray(format="rgb24")
+    # Of a phone; PyAV's `rotation` would turn what is to be mirrored.
+    if (matrix := frame.side_data.get("DISPLAYMATRIX")) is None:
+        return pixels
+    right, turned, _, back, down = np.sign(np.frombuffer(matrix, np.int32)[:5])
+    if (right and turned) or (back and down):
+        raise UnreadableError("it is shown turned by parts of a quarter: encode it upright")
+    if turned:
+        pixels, right, down = pixels.swapaxes(0, 1), back, turned
+    return pixels[::down, ::right]
+
+
+def check_opaque(pixels: NDArray[np.uint8]) -> None:
+    """Raise `UnreadableError` if a pixel of an image ``[H, W, 4]`` is transparent."""
+    if pixels[..., 3].min() < 255:
+        raise UnreadableError("its images are transparent: put them on a background of yours")
 
 
 def read_film(path: Path) -> Iterator[NDArray[np.uint8]]:
@@ -98,7 +124,7 @@ def _decoded(file: Path) -> Iterator[NDArray[np.uint8]]:
     with _decoding(file), importlib.import_module("av").open(str(file)) as film:
         check_depth(film.streams.video[0])
         for frame in film.decode(video=0):
-            yield frame.to_ndarray(format="rgb24")
+            yield decode_frame(frame)
 
 
 @contextlib.contextmanager

@@ -20,7 +20,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from bgpo_trl.data.dataset import resize_frames
-from bgpo_trl.data.film import UnreadableError, alike, check_depth, decode_image
+from bgpo_trl.data.film import UnreadableError, alike, check_depth, decode_frame, decode_image
 
 try:
     import pyarrow.parquet as pq
@@ -454,5 +454,5 @@ def _frames_at(
                     f"there is no frame at {time:.3f} s: it was never encoded, and those after it "
                     "would be taken for those before; get or record it again"
                 )
-            yield frame.to_ndarray(format="rgb24")
+            yield decode_frame(frame)
     return seconds

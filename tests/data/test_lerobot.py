@@ -398,7 +398,8 @@ class StandIn(ModuleType):
     def decode(self, stream):
         for number in self.kept:
             shown = np.full((32, 64, 3), GRAYS[number], np.uint8)
-            yield SimpleNamespace(time=number / 5, to_ndarray=lambda format, shown=shown: shown)
+            frame = {"time": number / 5, "side_data": {}, "format": SimpleNamespace(components=())}
+            yield SimpleNamespace(**frame, to_ndarray=lambda format, shown=shown: shown)
 
 
 @pytest.fixture

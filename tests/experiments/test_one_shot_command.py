@@ -1,13 +1,14 @@
 """`bgpo one-shot`: a film is read exactly or refused; what it prints is what the policy infers."""
 
 from collections import Counter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 import bgpo_trl
-from bgpo_trl.data.film import read_film
+from bgpo_trl.data.film import UnreadableError, decode_frame, read_film
 from bgpo_trl.experiments.arguments import OneShotArguments
 from bgpo_trl.experiments.watch import one_shot
 
@@ -64,6 +65,32 @@ def test_images_are_upright_as_their_camera_says(tmp_path):
     exif[0x0112] = 6  # to be turned by a quarter, clockwise
     image.save(tmp_path / "0.png", exif=exif)
     np.testing.assert_array_equal([*read_film(tmp_path)], [np.rot90(FRAMES[0], -1)])
+
+
+def test_frames_of_films_are_upright_and_opaque():
+    """Here in place of PyAV's."""
+
+    def decoded(matrix=None, alpha=255):
+        clear = np.dstack([FRAMES[0], np.full(FRAMES.shape[1:3], alpha, np.uint8)])
+        components = [SimpleNamespace(is_alpha=channel == 3) for channel in range(4)]
+        frame = SimpleNamespace(format=SimpleNamespace(components=components), side_data={})
+        if matrix is not None:
+            shown = [[*matrix[:2], 0], [*matrix[2:], 0], [0, 0, 1]]
+            frame.side_data["DISPLAYMATRIX"] = np.array(shown, np.int32) << 16
+        frame.to_ndarray = lambda format: {"rgb24": FRAMES[0], "rgba": clear}[format]
+        return decode_frame(frame)
+
+    for matrix, upright in (
+        (None, FRAMES[0]),
+        ((0, 1, -1, 0), np.rot90(FRAMES[0], -1)),  # of a phone held upright
+        ((0, -1, 1, 0), np.rot90(FRAMES[0])),
+        ((-1, 0, 0, -1), np.rot90(FRAMES[0], 2)),
+        ((-1, 0, 0, 1), FRAMES[0][:, ::-1]),
+    ):
+        np.testing.assert_array_equal(decoded(matrix), upright)
+    for wrong, cause in (({"alpha": 254}, "transparent"), ({"matrix": (1, 1, -1, 1)}, "a quarter")):
+        with pytest.raises(UnreadableError, match=cause):
+            decoded(**wrong)
 
 
 def test_what_cannot_be_read_is_refused_in_one_line(film, tmp_path, refused):
