@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import MemoryMappedTensor, TensorDict
+from tensordict import MemoryMappedTensor, TensorDict, TensorDictBase
 from torch import Tensor
 
 from bgpo_trl.errors import as_shape
@@ -151,6 +151,29 @@ def read_meta(path: Path) -> dict:
     if not isinstance(meta, dict) or not _is_complete(meta):
         raise ValueError(f"{path / META} is damaged; remove {path} and {_REMEDY}")
     return meta
+
+
+def check_scene(
+    identity: str | None, *datasets: TensorDictBase | Mapping[str, Tensor] | None
+) -> None:
+    """Check that datasets show the scene of encoders, given its identity.
+
+    Only those opened from files tell, before rows of them are selected; others are accepted.
+
+    Raises:
+        ValueError: If one shows another scene, or another version of it.
+    """
+    for dataset in datasets:
+        file = None if dataset is None else getattr(dataset["pixels"], "filename", None)
+        if identity is None or file is None or not (path := Path(file).parent / META).is_file():
+            continue
+        meta = read_meta(path.parent)
+        found = f"{meta['scene']} {meta['scene_version']}"
+        if found != identity:
+            raise ValueError(
+                f"{path.parent} shows the scene {found}, the encoders {identity}: give recordings "
+                "and encoders of the same"
+            )
 
 
 def _is_complete(meta: Mapping[str, Any]) -> bool:

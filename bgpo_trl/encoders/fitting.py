@@ -19,6 +19,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from bgpo_trl.configs import InverseModelConfig, RepresentationConfig
+from bgpo_trl.data.dataset import check_scene
 from bgpo_trl.encoders.representation import (
     Representation,
     encode_frames,
@@ -80,12 +81,13 @@ def train_representation(
         The trained encoders, on the CPU, in eval mode, without gradients.
 
     Raises:
-        ValueError: If the dataset or the configuration cannot be trained on, no imported module has
-            the frame network, or ``checkpoint`` belongs to a training with another configuration;
-            or if ``largest_action`` leaves no action to learn from, or more than a twentieth of
-            those demonstrated out.
+        ValueError: If the dataset or the configuration cannot be trained on, dataset or play show
+            another scene, no imported module has the frame network, or ``checkpoint`` belongs to a
+            training with another configuration; or if ``largest_action`` leaves no action to learn
+            from, or more than a twentieth of those demonstrated out.
     """
     config = config or RepresentationConfig()
+    check_scene(scene, dataset, play)
     train, _ = split(dataset)
     seen = [train] if play is None else [train, part(play, "the recorded play")]
     own = seen[-1]
@@ -131,6 +133,7 @@ def retrain_inverse(
     errors are as for `train_representation`; play without actions is refused, too.
     """
     fit = Fit(config or RepresentationConfig(), **how)
+    check_scene(representation.metadata.get("scene"), play, shown)
     own = part(play, "the recorded play")
     if "action" not in own:
         raise ValueError("the inverse model learns from actions, which this play lacks: record it")

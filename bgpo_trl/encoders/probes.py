@@ -22,6 +22,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
+from bgpo_trl.data.dataset import check_scene
 from bgpo_trl.encoders.representation import (
     Representation,
     encode_frames,
@@ -82,8 +83,10 @@ def probe(
         small, of whose deviation less than a half is reconstructed.
 
     Raises:
-        ValueError: If the dataset has no training or no held-out demonstrations.
+        ValueError: If the dataset has no training or no held-out demonstrations, or it or play show
+            another scene than the encoders.
     """
+    check_scene(representation.metadata.get("scene"), dataset, play)
     network, lae = representation.frame_network, representation.lae
     train, held_out = _encoded(network, dataset)
     result = _probe_state(columns, train, held_out)

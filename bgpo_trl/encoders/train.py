@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
+from bgpo_trl.data.dataset import check_scene
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.fitting import Log, retrain_inverse, train_representation
 from bgpo_trl.encoders.imitation import choose_noise
@@ -133,7 +134,11 @@ def make_bank(
             embeddings alone, without demonstrations as experience.
         spread: Share of the range of start states that the dataset was recorded over.
         compare: Whether to warn of what `mismatch` finds, as for other data than the encoders' own.
+
+    Raises:
+        ValueError: If the dataset shows another scene than the encoders.
     """
+    check_scene(representation.metadata.get("scene"), dataset)
     length = dataset["length"]
     latent = encode_frames(representation.frame_network, dataset)
     inverse = representation.inverse

@@ -21,7 +21,7 @@ from bgpo_trl.experiments.arguments import (
 from bgpo_trl.experiments.settings import chosen_tasks
 from bgpo_trl.machine import choose_device
 from bgpo_trl.runs.provenance import command
-from bgpo_trl.scenes import Scene, find_scene
+from bgpo_trl.scenes import find_scene
 
 
 def record(arguments: RecordArguments) -> str:
@@ -40,7 +40,7 @@ def encoders(arguments: EncodersArguments) -> str:
     scene, keep = find_scene(meta["scene"]), arguments.keep
     train_encoders(
         dataset,
-        _play(arguments.play, scene),
+        _play(arguments.play),
         arguments.weights or arguments.folder / "encoders.safetensors",
         arguments.folder,
         arguments.config,
@@ -54,14 +54,9 @@ def encoders(arguments: EncodersArguments) -> str:
     return verdict_in(arguments.folder, scene)
 
 
-def _play(path: Path | None, scene: Scene) -> TensorDict | None:
-    """Open recorded play, if any; raise ``ValueError`` if it is of another scene."""
-    if path is None:
-        return None
-    meta = read_meta(path)
-    recorded_in = f"{meta['scene']} {meta['scene_version']}"
-    scene.check_identity(recorded_in, path, "record play of this scene")
-    return load_demonstrations(path)
+def _play(path: Path | None) -> TensorDict | None:
+    """Open recorded play, if any."""
+    return None if path is None else load_demonstrations(path)
 
 
 def bank(arguments: MakeBankArguments) -> str:
@@ -86,6 +81,6 @@ def probes(arguments: ProbesArguments) -> str:
     meta, dataset = read_meta(arguments.dataset), load_demonstrations(arguments.dataset)
     scene = find_scene(meta["scene"])
     weights = arguments.encoders or default_weights(meta["tasks"], scene=scene)
-    representation, play = load_representation(weights, scene=scene), _play(arguments.play, scene)
+    representation, play = load_representation(weights, scene=scene), _play(arguments.play)
     probe(representation, dataset, arguments.out, play=play, columns=scene.state)
     return verdict_in(arguments.out, scene)

@@ -12,7 +12,9 @@ from torchrl.envs import check_env_specs
 
 from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.encoders.train import train_encoders
+from bgpo_trl.encoders.fitting import retrain_inverse
+from bgpo_trl.encoders.probes import probe
+from bgpo_trl.encoders.train import make_bank, train_encoders
 from bgpo_trl.evaluation import evaluate_random_policy
 from bgpo_trl.experiments.measure import draw, measure
 from bgpo_trl.experiments.watch import WatchArguments, watch
@@ -128,6 +130,25 @@ def test_encoders_of_another_robot_are_refused_whatever_its_version(pretrained, 
         with pytest.raises(ValueError, match=rf"{part} is of the scene dot dot-1, this is nico"):
             trainer_of(tmp_path / "run", (encoders, given), run)
     assert not (tmp_path / "run").exists()
+
+
+def test_recordings_of_another_robot_are_refused(pretrained, tmp_path):
+    encoders, _ = pretrained
+    noise = np.random.default_rng(0).integers(256, size=(2, 2, 4, 16, 24, 3), dtype=np.uint8)
+    shown = {task: [{"pixels": one} for one in noise[row]] for row, task in enumerate(TASKS)}
+    dot, cart = (
+        write_demonstrations(tmp_path / robot.name, shown, scene=robot, held_out_per_task=1)
+        for robot in (scene(), replace(scene(), name="cart"))
+    )
+    parts, options = (tmp_path / "weights", tmp_path / "log"), {"tasks": TASKS, "scene": scene()}
+    for call in (
+        lambda: make_bank(encoders, cart, tasks=TASKS),
+        lambda: train_encoders(dot, cart, *parts, TINY_ENCODERS, **options),
+        lambda: retrain_inverse(encoders, cart),
+        lambda: probe(encoders, dot, play=cart),
+    ):
+        with pytest.raises(ValueError, match="cart shows the scene cart dot-1, the encoders dot d"):
+            call()
 
 
 @pytest.mark.parametrize("wrong", [{"name": "two dots"}, {"name": ""}, {"version": 1}])
