@@ -63,7 +63,8 @@ def read_lerobot(
         joints_key: Feature with the readings of the scene's joints, such as
             ``"observation.state"``; None leaves them out.
         success_key: Feature that is true in a frame of each episode that succeeded, if the dataset
-            has it. Failed episodes are refused; with None, they are read.
+            has it; asked for if only others have success in their name. Failed episodes are
+            refused; with None, they are read.
         frame_shape: Height and width to which frames are resized, see `resize_frames`; by default
             they stay as they are.
         episodes: Numbers of the episodes to read; None: all.
@@ -94,11 +95,13 @@ def read_lerobot(
         )
     reader = _Reader(Path(path), image_key, frame_shape)
     reader.check_numeric(chosen)
-    may_lack = () if logged else (None, "next.success")
+    like = [name for name in reader.features if "success" in name]
+    may_lack = () if logged else (None, *([] if like else ["next.success"]))
     if success_key not in (*reader.features, *may_lack):
         raise ValueError(
             f"{path} has no {success_key!r}, by which episodes say whether they succeeded: give "
-            f"one of its features as success_key, {', '.join(reader.features)}"
+            f"one of its features as success_key, {', '.join(like or reader.features)}"
+            + ("" if logged else ", or None to read all")
         )
     found = reader.read(chosen, success_key, episodes, tasks, stride, logged)
     if reader.doubt:

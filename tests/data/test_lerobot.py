@@ -260,6 +260,16 @@ def test_failed_episodes_are_no_demonstrations_unless_asked_for(written, refused
     write_logged_episodes(written.parent / "log", logged, scene="nico")
 
 
+def test_a_success_of_another_name_is_asked_for(written, refused):
+    """The failed episode was a demonstration."""
+    add_feature(written, "success", {"dtype": "int64", "shape": [1]})
+    replaced("success", [0] * 5 + [1] * 6)(written)
+    refused(lambda: read_lerobot(written), "no 'next.success'", "success_key, success, or None")
+    with pytest.raises(ValueError, match="failed, without 'success': 0;"):
+        read_lerobot(written, success_key="success")
+    assert [len(some) for some in read_lerobot(written, success_key=None).values()] == [1, 2]
+
+
 @pytest.mark.parametrize("value", [np.nan, -0.5, 2])
 def test_numbers_that_are_no_success_are_refused(written, refused, value):
     """A reward, or NaN, is true to Python."""
