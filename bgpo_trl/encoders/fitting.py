@@ -340,6 +340,8 @@ def _check_actions(
 ) -> None:
     """Check, before hours of training, that the inverse model sees what it is to infer.
 
+    If those of demonstrations are unknown, it warns of actions left out of what it learns from.
+
     Args:
         shown: Demonstrations, of whose actions at most a twentieth may be left out.
         own: Episodes that it learns from; some of their actions have to be left.
@@ -353,14 +355,18 @@ def _check_actions(
             continue
         valid, small = _steps_to_infer(episodes, config)
         left_out = float((valid & ~small).sum() / valid.sum())
-        if left_out > most or left_out == 1:
-            component = int(episodes.get("action")[valid].abs().mean(0).argmax())
-            raise ValueError(
+        if left_out > 0.05:
+            component = int(episodes.get("action")[valid & ~small].abs().mean(0).argmax())
+            told = (
                 f"largest_action {config.largest_action} leaves {left_out:.0%} of the actions out, "
                 f"most by component {component}, and the inverse model would never see them: raise "
                 "it (`bgpo encoders --config.inverse.largest-action`, or largest_action of the "
                 "scene), 1 keeps all"
             )
+            if left_out > most or left_out == 1:
+                raise ValueError(told)
+            if shown is None or "action" not in shown:
+                warnings.warn(f"{told}; or leave it, if demonstrations have none", stacklevel=3)
 
 
 def _train_inverse(latent: Tensor, episodes: TensorDictBase, fit: Fit) -> InverseModel:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import warnings
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -256,6 +257,25 @@ def test_actions_that_the_inverse_model_would_never_see_are_refused_before_train
         play = with_a_gripper(8)
         train(squares(8).exclude("action"), limited, play=play, log=log.append)
     assert not log
+
+
+def test_steps_of_play_that_are_left_out_are_told_unless_demonstrations_have_none() -> None:
+    """Component 3 is larger on average, but never beyond the largest."""
+    play = squares(8)
+    play["action"][..., :3].clamp_(-0.1, 0.1)
+    play["action"][..., 3] = 0.5
+    play["action"][:, :2, 1] = -1.0
+    share = 2 / float((play["length"][play["train"]] - 1).double().mean())
+    shown, limited = play.clone(), replace(TINY, inverse=replace(TINY.inverse, largest_action=0.6))
+    shown["action"].clamp_(-0.5, 0.5)
+    told = (
+        f"leaves {share:.0%} of the actions out, most by component 1, .* if demonstrations have n"
+    )
+    with pytest.warns(UserWarning, match=told):
+        train(shown.exclude("action"), limited, play=play)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "largest_action")
+        train(shown, limited, play=play)
 
 
 def test_actions_beyond_the_largest_teach_the_inverse_model_nothing(tiny: Representation) -> None:
