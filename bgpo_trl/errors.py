@@ -4,9 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from numbers import Integral
+from pathlib import Path
 
 import torch
 from tensordict import NestedKey, TensorDictBase
+
+_LFS = b"version https://git-lfs"
+
+
+class UnreadableError(ValueError):
+    """A file cannot be taken as it is; the message says why."""
+
+
+def check_fetched(path: Path) -> None:
+    """Raise `UnreadableError` if a file is a pointer of Git LFS, left by a clone without it."""
+    if path.is_file():
+        with path.open("rb") as file:
+            if file.read(len(_LFS)) == _LFS:
+                raise UnreadableError(
+                    f"{path} is a pointer of Git LFS: get the file itself, git lfs pull"
+                )
 
 
 def missing_key(

@@ -47,6 +47,10 @@ TINY_ENCODERS = RepresentationConfig(
 """A training of encoders that ends within a second."""
 
 
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 9\n"
+"""What Git leaves in place of a file if Git LFS is not installed."""
+
+
 def contents(folder: Path) -> dict[Path, bytes | None]:
     """Return all that lies below a folder: the bytes of each file, None for a folder."""
     return {

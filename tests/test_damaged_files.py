@@ -24,7 +24,7 @@ from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.scenes.nico import NICO
-from tests.helpers import UNPICKLED, Malice
+from tests.helpers import POINTER, UNPICKLED, Malice
 
 FILES = [f"{key}.memmap" for key in ("pixels", "state", "action", "length", "task", "train")]
 FILES += ["dataset.json", "meta.json"]
@@ -153,6 +153,17 @@ def test_damaged_bytes(written, check, kind, n):
         check(kind, lambda copy: do_damage(copy / name, damage))
 
     holds()
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [("dataset", name) for name in FILES[:-1]] + [(k, k) for k in READ if k != "dataset"],
+)
+def test_pointers_of_git_lfs_are_named(written, tmp_path, kind, name):
+    copy = Path(shutil.copytree(written[kind], tmp_path / "copy"))
+    (copy / name).write_bytes(POINTER)
+    with pytest.raises(ValueError, match=rf"{name} is a pointer of Git LFS: .* git lfs pull"):
+        READ[kind](copy)
 
 
 json_values = st.recursive(

@@ -11,6 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from bgpo_trl.errors import check_fetched
 from bgpo_trl.files.tensor_file import digest, load_tensors, save_tensors
 from bgpo_trl.scenes.scene import check_name
 
@@ -312,6 +313,7 @@ class DemonstrationBank:
             ValueError: If it is missing, damaged, or was made by other encoders.
         """
         remedy = "make it again with `bgpo bank`, or use `--train-encoders`"
+        check_fetched(Path(path))
         try:
             tensors, meta = load_tensors(path)
             columns = {k.removeprefix("steps."): t for k, t in tensors.items() if "." in k}

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tensordict import MemoryMappedTensor, TensorDict, TensorDictBase
 from torch import Tensor
 
-from bgpo_trl.errors import as_shape
+from bgpo_trl.errors import as_shape, check_fetched
 from bgpo_trl.files.writing import make_folder, new_folder, write_json
 from bgpo_trl.scenes import SCENES, Scene, find_scene
 
@@ -118,6 +118,7 @@ def open_dataset(path: Path, meta: Mapping[str, Any]) -> TensorDict:
     columns = _empty(meta)
     for key, value in columns.items():
         file = path / f"{key}.memmap"
+        check_fetched(file)
         if not file.exists() or file.stat().st_size != value.nbytes:
             raise ValueError(f"{file} is missing or truncated; remove {path} and {_REMEDY}")
         kind = {"dtype": value.dtype, "shape": value.shape}
@@ -140,6 +141,7 @@ def read_meta(path: Path) -> dict:
     Raises:
         ValueError: If there is no recording, or its settings are damaged.
     """
+    check_fetched(path / META)
     try:
         meta = json.loads((path / META).read_text())
     except OSError:

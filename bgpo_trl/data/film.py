@@ -14,11 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
+from bgpo_trl.errors import UnreadableError, check_fetched
+
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp")
-
-
-class UnreadableError(ValueError):
-    """A file cannot be taken as it is; the message says why."""
 
 
 def decode_image(content: bytes) -> NDArray[np.uint8]:
@@ -130,6 +128,7 @@ def _decoded(file: Path) -> Iterator[NDArray[np.uint8]]:
 @contextlib.contextmanager
 def _decoding(file: Path) -> Iterator[None]:
     """Turn whatever goes wrong with a file into one line."""
+    check_fetched(file)
     try:
         yield
     except UnreadableError as error:

@@ -20,7 +20,8 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from bgpo_trl.data.dataset import resize_frames
-from bgpo_trl.data.film import UnreadableError, alike, check_depth, decode_frame, decode_image
+from bgpo_trl.data.film import alike, check_depth, decode_frame, decode_image
+from bgpo_trl.errors import UnreadableError, check_fetched
 
 try:
     import pyarrow.parquet as pq
@@ -117,6 +118,8 @@ def read_lerobot(
 @contextlib.contextmanager
 def _reading(source: object) -> Iterator[None]:
     """Turn whatever goes wrong with a file into one line."""
+    if isinstance(source, Path):
+        check_fetched(source)
     try:
         yield
     except UnreadableError as error:
@@ -124,12 +127,6 @@ def _reading(source: object) -> Iterator[None]:
     except FileNotFoundError:
         raise UnreadableError(f"{source} is missing: give the folder of a whole dataset") from None
     except Exception as error:
-        if isinstance(source, Path) and source.is_file():
-            with source.open("rb") as file:
-                if file.read(len(_LFS)) == _LFS:
-                    raise UnreadableError(
-                        f"{source} is a pointer of Git LFS: get the file itself, git lfs pull"
-                    ) from None
         cause = " ".join(f"{type(error).__name__}: {error}".split())
         raise UnreadableError(f"{source} is damaged or of another format: {cause}") from error
 
@@ -163,11 +160,12 @@ class _Reader:
         if image_key is None and len(cameras) == 1:
             image_key = cameras[0]
         if image_key not in cameras:
-            lacks = "is to be read" if image_key is None else f"is no camera called {image_key!r}"
-            lacks = f"has a depth map {image_key!r}" if image_key in depth else f"there {lacks}"
-            raise ValueError(
-                f"{path}: {lacks}: give one of its cameras as image_key: {', '.join(cameras)}"
-            )
+            lacks = f"has a depth map {image_key!r}"
+            if image_key not in depth:
+                lacks = (
+                    f"has no camera called {image_key!r}" if image_key else "has several cameras"
+                )
+            raise ValueError(f"{path} {lacks}: give one of {', '.join(cameras)} as image_key")
         self.path, self.image_key, self.frame_shape = path, image_key, frame_shape
         self.is_video = self.features[image_key] == "video"
         self._images: tuple[Path | None, Sequence[Any]] = (None, [])
@@ -398,10 +396,8 @@ class _Reader:
         file = (self.path / str(image["path"])).resolve()
         if not file.is_relative_to(self.path.resolve()) or not file.is_file():
             raise UnreadableError(f"its image {image['path']!r} is no file of the dataset")
+        check_fetched(file)
         return file.read_bytes()
-
-
-_LFS = b"version https://git-lfs"
 
 
 def _is_depth(feature: Mapping[str, Any]) -> bool:

@@ -20,6 +20,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
+from bgpo_trl.errors import check_fetched
 from bgpo_trl.files.tensor_file import digest, load_tensors, save_tensors
 from bgpo_trl.modules.frame_network import FrameNetwork, FrameNetworkError, make_frame_network
 from bgpo_trl.modules.inverse_model import InverseModel
@@ -165,6 +166,7 @@ def load_representation(path: str | Path, *, scene: Scene | None = None) -> Repr
     """
     path = Path(path)
     remedy = "train some with `bgpo encoders` or --train-encoders"
+    check_fetched(path)
     try:
         tensors, metadata = load_tensors(path)
         encoders = _of_tensors(tensors, metadata)

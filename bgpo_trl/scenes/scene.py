@@ -323,7 +323,9 @@ class Scene:
         """
         if found == self.identity:
             return
-        name = "" if found is None else found.partition(" ")[0]
+        if found is None:
+            raise ValueError(f"{what} names no scene, this is {self.identity}: {remedy}")
+        name = found.partition(" ")[0]
         if name != self.name:
             remedy = f"name the scene {name!r} (--scene {name}), or take what is of {self.name!r}"
         raise ValueError(f"{what} is of the scene {found}, this is {self.identity}: {remedy}")

@@ -31,7 +31,7 @@ from bgpo_trl.data.dataset import (  # noqa: E402
 )
 from bgpo_trl.data.lerobot import read_lerobot  # noqa: E402
 from bgpo_trl.data.lerobot_export import write_lerobot  # noqa: E402
-from tests.helpers import edit  # noqa: E402
+from tests.helpers import POINTER, edit  # noqa: E402
 
 TASKS = ("grasp_glass", "push_green_to_white")
 STATE = "observation.environment_state"
@@ -194,7 +194,7 @@ def saved(image, kind="png"):
             "evenly",
         ),
         (
-            lambda p: (p / INFO).write_text("version https://git-lfs.github.com/spec/v1\noid sha"),
+            lambda p: (p / INFO).write_bytes(POINTER),
             "info.json is a pointer of Git LFS",
             "git lfs pull",
         ),
@@ -217,7 +217,11 @@ def saved(image, kind="png"):
         (lambda p: (p / "meta/tasks.parquet").write_bytes(b"PAR1"), "tasks.parquet", "damaged"),
         (edit_info(codebase_version="v2.1"), "version v2.1, not 3", "convert it"),
         (edit_info(features={}), "has no camera of colors, only nothing", "record some"),
-        (edit_info(features={"a": IMAGE, "b": IMAGE}), "a, b", "image_key"),
+        (
+            edit_info(features={"a": IMAGE, "b": IMAGE}),
+            "has several cameras",
+            "one of a, b as image_key",
+        ),
     ],
 )
 def test_incomplete_and_damaged_datasets_are_refused(written, refused, damage, cause, remedy):
@@ -227,7 +231,7 @@ def test_incomplete_and_damaged_datasets_are_refused(written, refused, damage, c
 
 def test_unknown_features_are_refused(written, refused, monkeypatch):
     for wrong, cause in (
-        ({"image_key": "wrist"}, "there is no camera called 'wrist': give one of its cameras"),
+        ({"image_key": "wrist"}, f"has no camera called 'wrist': give one of {CAMERA} as"),
         ({"state_key": "joints"}, "no numbers 'joints': give the states' feature as state_key"),
         ({"action_key": "actoin"}, "no numbers 'actoin': give the actions' feature as action_key"),
         ({"action_key": CAMERA}, f"no numbers '{CAMERA}'"),
@@ -314,6 +318,9 @@ def test_images_may_lie_in_files_of_the_dataset_alone(written):
     beside = [{"bytes": None, "path": f"images/{number}.png"} for number in range(11)]
     replaced(CAMERA, beside)(written)
     np.testing.assert_array_equal(read_lerobot(written)[TASKS[0]][0]["pixels"], expected)
+    (written / "images" / "6.png").write_bytes(POINTER)
+    with pytest.raises(ValueError, match=r"episode 1 of .*6.png is a pointer of Git LFS: get"):
+        read_lerobot(written)
     (written.parent / "secret.png").write_bytes(rows[CAMERA][0]["bytes"])
     replaced(CAMERA, [{"bytes": None, "path": "../secret.png"}] * 11)(written)
     with pytest.raises(ValueError, match=r"episode 0 of .*'../secret.png' is no file of the data"):

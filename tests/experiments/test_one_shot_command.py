@@ -8,9 +8,11 @@ import pytest
 from PIL import Image
 
 import bgpo_trl
-from bgpo_trl.data.film import UnreadableError, decode_frame, read_film
+from bgpo_trl.data.film import decode_frame, read_film
+from bgpo_trl.errors import UnreadableError
 from bgpo_trl.experiments.arguments import OneShotArguments
 from bgpo_trl.experiments.watch import one_shot
+from tests.helpers import POINTER
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 FRAMES = np.random.default_rng(0).integers(256, size=(11, 64, 128, 3), dtype=np.uint8)
@@ -112,3 +114,5 @@ def test_what_cannot_be_read_is_refused_in_one_line(film, tmp_path, refused):
         path.unlink()
     (film / "broken.png").write_bytes(b"\x89PNG")
     refused(lambda: [*read_film(film)], "broken.png cannot be decoded", "as PNG")
+    (film / "broken.png").write_bytes(POINTER)
+    refused(lambda: [*read_film(film)], "broken.png is a pointer of Git LFS", "git lfs pull")

@@ -133,6 +133,11 @@ def test_data_and_encoders_of_another_setup_are_refused(tmp_path, monkeypatch, r
         f"the file is of the scene {robot.identity}, this is {other.identity}",
         "train anew",
     )
+    refused(
+        lambda: other.check_identity(None, "the file", "train anew"),
+        f"the file names no scene, this is {other.identity}",
+        "train anew",
+    )
 
 
 def test_a_setup_is_words_and_leaves_the_rate_to_the_scene():
