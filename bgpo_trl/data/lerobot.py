@@ -11,7 +11,7 @@ import importlib.util
 import itertools
 import json
 import warnings
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -202,18 +202,18 @@ class _Reader:
         names = self._task_names()
         success = [] if success_key not in self.features else [str(success_key)]
         indices = ["episode_index", "frame_index", "task_index"]
-        rows = self._table("data", [*indices, "timestamp", *chosen.values(), *success])
-        rows = rows.assign(**{name: _scalars(rows[name]) for name in [*indices, "timestamp"]})
+        rows = self._table("data", [*indices, "timestamp", *success], chosen.values())
         metadata = self._metadata({*rows["episode_index"]})
         by_episode = dict(iter(rows.sort_values("frame_index").groupby("episode_index")))
         for asked, there, what in (
             (episodes, metadata["episode_index"].tolist(), "episode"),
             (tasks, [*names.values()], "task"),
         ):
-            missing = [one for one in asked or () if one not in there]
+            missing = [one for one in (() if asked is None else asked) if one not in there]
             if missing:
                 raise ValueError(
-                    f"{self.path} has no {what} {missing[0]!r}: choose among {_some(there)}"
+                    f"{self.path} has no {what} {np.asarray(missing[0]).item()!r}: choose among "
+                    f"{_some(there)}"
                 )
         found: dict[str, list[Episode]] = {
             name: [] for name in names.values() if tasks is None or name in tasks
@@ -251,7 +251,7 @@ class _Reader:
 
     def _succeeded(self, number: int, column: pd.Series) -> bool:
         """Return whether a frame of an episode says that it succeeded."""
-        flags = _scalars(column).tolist()
+        flags = column.tolist()
         other = [flag for flag in flags if flag is not None and flag not in (0, 1)]
         if other:
             raise ValueError(
@@ -323,8 +323,9 @@ class _Reader:
             "look at them, or record the episode again"
         )
 
-    def _table(self, folder: str, columns: list[str]) -> pd.DataFrame:
+    def _table(self, folder: str, scalars: list[str], others: Iterable[str] = ()) -> pd.DataFrame:
         """Return columns of all Parquet files of a folder, with ``file`` and ``row`` in it."""
+        columns = [*scalars, *others]
         files = sorted((self.path / folder).glob("*/*.parquet")) or [self.path / folder]
         tables = []
         for file in files:
@@ -333,7 +334,9 @@ class _Reader:
                     raise FileNotFoundError
                 table = pq.ParquetFile(file).read(columns).to_pandas()[columns]
                 tables.append(table.assign(file=[file] * len(table), row=range(len(table))))
-        return pd.concat(tables)
+        table = pd.concat(tables)
+        with _reading(self.path / folder):
+            return table.assign(**{name: _scalars(table[name]) for name in scalars})
 
     def _episode(
         self, rows: pd.DataFrame, chosen: Mapping[str, str], place: Sequence[Any], stride: int
@@ -408,7 +411,14 @@ def _is_depth(feature: Mapping[str, Any]) -> bool:
 
 def _scalars(column: pd.Series) -> NDArray[Any]:
     """Return a column of numbers, of which each may be in a list of its own."""
-    return np.array([np.asarray(cell).item() for cell in column])
+    try:
+        return np.array([np.asarray(cell).item() for cell in column])
+    except ValueError:
+        cells = (np.ravel(cell).tolist() for cell in column)
+        wrong = next(cell for cell in cells if len(cell) != 1)
+        raise UnreadableError(
+            f"{column.name} has [{_some(wrong)}] in a row: give one number a row"
+        ) from None
 
 
 def _some(values: Sequence[Any]) -> str:

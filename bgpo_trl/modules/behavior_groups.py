@@ -202,16 +202,16 @@ class BehaviorGroups:
             batch_size=shape,
         )
 
-    def fits(self, start: Tensor, group: int) -> bool:
+    def fits(self, start: Numbers, group: int) -> bool:
         """Return whether a start ``[f]`` fits a group; all do if there are too few to compare."""
         rows = np.flatnonzero(self.group == group)
         if len(rows) < least_size(len(self.points), self.smallest) or not self.starts.size:
             return True
-        starts = torch.from_numpy(self.starts[rows])
+        start, starts = as_tensor(start, "start").cpu().float(), torch.from_numpy(self.starts[rows])
         apart = torch.cdist(starts, starts).fill_diagonal_(torch.inf).amin(-1)
         return bool(torch.cdist(start[None], starts).amin() <= apart.quantile(_FITTING_SHARE))
 
-    def expert(self, start: Tensor, group: int) -> tuple[int, bool]:
+    def expert(self, start: Numbers, group: int) -> tuple[int, bool]:
         """Return the group whose expert is to play an episode.
 
         Args:

@@ -292,6 +292,12 @@ class Scene:
                 f"action_size and max_steps must be at least 1, got {self.action_size} and "
                 f"{self.max_steps}"
             )
+        if isinstance(self.make_env, type) and issubclass(self.make_env, Simulation):
+            name = self.make_env.__name__
+            raise ValueError(
+                f"make_env makes environments, but {name} is a simulation: give "
+                f"partial(SimulationEnv, {name})"
+            )
         if self.rate is not None and not 0 < self.rate < math.inf:
             raise ValueError(f"rate is {self.rate}: give the actions per second, or None")
         if not 0 < self.largest_action <= 1 or self.bank_actions not in ("recorded", "inferred"):

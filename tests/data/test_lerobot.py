@@ -204,6 +204,16 @@ def saved(image, kind="png"):
             "tasks.parquet",
         ),
         (replaced("task_index", range(11)), "has the tasks [0, 1, 2, 3, 4]", "one task"),
+        (
+            replaced("task_index", [[0, 1]] * 11),
+            "data: task_index has [0, 1] in a row",
+            "one number",
+        ),
+        (
+            replaced("length", [[5], [], [4]], EPISODES),
+            "meta/episodes: length has [] in a row",
+            "one number",
+        ),
         (without(columns="frame_index"), "damaged or of another format", "frame_index"),
         (replaced(CAMERA, [{"bytes": b"PNG"}] * 11), "episode 0", "is damaged"),
         (
@@ -235,7 +245,7 @@ def test_unknown_features_are_refused(written, refused, monkeypatch):
         ({"state_key": "joints"}, "no numbers 'joints': give the states' feature as state_key"),
         ({"action_key": "actoin"}, "no numbers 'actoin': give the actions' feature as action_key"),
         ({"action_key": CAMERA}, f"no numbers '{CAMERA}'"),
-        ({"episodes": [1, 3]}, "no episode 3: choose among 0, 1, 2"),
+        ({"episodes": np.array([1, 3])}, "no episode 3: choose among 0, 1, 2"),
         ({"tasks": ["wipe"]}, "no task 'wipe': choose among grasp_glass"),
         ({"stride": 2}, "say how actions become one"),
         ({"stride": 0}, "stride 0"),
@@ -302,7 +312,8 @@ def test_tasks_and_numbers_may_be_stored_as_other_libraries_do(written):
     tasks = pa.table({"task": [*TASKS], "task_index": [0, 1]})  # without an index of pandas
     pq.write_table(tasks, written / TASK_FILE)
     edit_rows(written, lambda rows: rows.assign(task_index=[[i] for i in rows["task_index"]]))
-    found = read_lerobot(written)
+    replaced("length", [[n] for n in LENGTHS], EPISODES)(written)
+    found = read_lerobot(written, episodes=np.arange(3))
     assert [*found] == [*TASKS]
     for name in TASKS:
         for one, other in zip(found[name], expected[name], strict=True):

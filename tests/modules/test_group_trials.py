@@ -53,6 +53,8 @@ def test_a_start_fits_a_group_whose_demonstrations_began_like_it():
     assert groups.numbers == [0, 1, 2, 3]
     for start, fitting in ((LEFT, [0, 2]), (RIGHT, [1, 3]), (0 * LEFT, [])):
         assert [g for g in range(4) if groups.fits(start, g)] == fitting
+    assert groups.expert(LEFT.tolist(), 0) == (0, True)
+    assert not groups.fits(RIGHT.double().numpy(), 0)
     new = LEFT + torch.randn(300, 2, generator=torch.Generator().manual_seed(1))
     share = np.mean([groups.fits(start, 0) for start in new])
     assert 0.8 < share < 1.0

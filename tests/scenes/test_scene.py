@@ -385,6 +385,10 @@ def test_a_scene_without_a_simulation_serves_demonstrations(tmp_path):
     assert len(written) == 4
     with pytest.raises(ValueError, match="the scene 'dot' has no simulation: give it a make_env"):
         bare.simulate(TASKS)
+    with pytest.raises(
+        ValueError, match=r"Dot is a simulation: give partial\(SimulationEnv, Dot\)"
+    ):
+        replace(scene(), make_env=Dot)
 
 
 def test_episodes_are_no_longer_than_those_of_the_scene(pretrained, dot, tmp_path):
