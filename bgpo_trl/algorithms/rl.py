@@ -48,7 +48,7 @@ class Learner:
         self.policy, self.loss, self.config, self.sources = policy, loss, config, sources
         self._prefixes = {f"{source}.": f"{at}." if at else "" for at, source in sources.items()}
         self.target_update = ForeachSoftUpdate(loss, tau=config.tau)
-        read = tuple(self._prefixes) if config.averaging else ("no network",)
+        read = tuple(self._prefixes) if config.averaging else ()
         parameters = [(n, p) for n, p in loss.named_parameters() if p.requires_grad]
         self.average = {n: p.detach().clone() for n, p in parameters if n.startswith(read)}
         self.n_averaged = loss.n_imitated.clone()

@@ -81,9 +81,9 @@ class RLConfig(Settings):
     policy_delay: int = 1
     """Updates of the critics, and of a clone, per update of the actor."""
     averaging: float = 0.0
-    """Share of the latest weights in the averages with which tests act, or a tenth of the updates
-    so far if they are fewer; 0 to act with the latest weights. Ours: they vary by several points
-    from one test to the next."""
+    """Share that the latest weights have in the averages with which tests act; at first, 10 divided
+    by the number of updates so far. With 0, tests act with the latest weights. Ours: these vary by
+    several points from one test to the next."""
     caution: float = 1.0
     """With both proposals, standard deviations of the critics' gains by which their mean must be
     above 0 for the actor's proposal to be taken (`ProposalPolicy`)."""
