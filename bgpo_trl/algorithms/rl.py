@@ -48,12 +48,12 @@ class Learner:
         self.policy, self.loss, self.config, self.sources = policy, loss, config, sources
         self._prefixes = {f"{source}.": f"{at}." if at else "" for at, source in sources.items()}
         self.target_update = ForeachSoftUpdate(loss, tau=config.tau)
+        learned = {name: p for name, p in loss.named_parameters() if p.requires_grad}
+        self.optimizer = torch.optim.Adam(learned.values(), lr=config.learning_rate, fused=True)
         read = tuple(self._prefixes) if config.averaging else ()
-        parameters = [(n, p) for n, p in loss.named_parameters() if p.requires_grad]
-        self.average = {n: p.detach().clone() for n, p in parameters if n.startswith(read)}
+        self._latest = {name: p for name, p in learned.items() if name.startswith(read)}
+        self.average = {name: p.detach().clone() for name, p in self._latest.items()}
         self.n_averaged = loss.n_imitated.clone()
-        learned = [p for _, p in parameters]
-        self.optimizer = torch.optim.Adam(learned, lr=config.learning_rate, fused=True)
 
     @torch.no_grad()
     def act(
@@ -146,9 +146,9 @@ class Learner:
         learned = self.loss.trains(batch)
         self.n_averaged += learned
         share = (10.0 / self.n_averaged).clamp(self.config.averaging, 1.0) * learned
-        latest = dict(self.loss.named_parameters())
         for name, average in self.average.items():
-            average.lerp_(latest[name], share.reshape(*share.shape, *[1] * (average.ndim - 2)))
+            per_weight = share.reshape(*share.shape, *[1] * (average.ndim - 2))
+            average.lerp_(self._latest[name], per_weight)
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Return the losses ``[S, E]`` to minimize on transitions ``[S, E, B]``.

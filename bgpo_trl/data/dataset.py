@@ -155,6 +155,11 @@ def read_meta(path: Path) -> dict:
     return meta
 
 
+def scene_of(meta: Mapping[str, Any]) -> str:
+    """Return the identity of the scene that a recording's settings name, as `Scene.identity`."""
+    return f"{meta['scene']} {meta['scene_version']}"
+
+
 def check_scene(
     identity: str | None, *datasets: TensorDictBase | Mapping[str, Tensor] | None
 ) -> None:
@@ -170,7 +175,7 @@ def check_scene(
         if identity is None or file is None or not (path := Path(file).parent / META).is_file():
             continue
         meta = read_meta(path.parent)
-        found = f"{meta['scene']} {meta['scene_version']}"
+        found = scene_of(meta)
         if found != identity:
             raise ValueError(
                 f"{path.parent} shows the scene {found}, the encoders {identity}: give recordings "

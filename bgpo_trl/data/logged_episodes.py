@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.data.dataset import open_complete
+from bgpo_trl.data.dataset import open_complete, scene_of
 from bgpo_trl.scenes import Outcome, Scene, Simulation, SimulationEnv
 
 
@@ -52,8 +52,7 @@ class LoggedEpisodes:
                 "with write_logged_episodes (docs/extending.md)"
             )
         digest = hashlib.sha256(json.dumps([meta["checksum"], meta["tasks"]]).encode())
-        scene = f"{meta['scene']} {meta['scene_version']}"
-        return cls(path, episodes, tuple(meta["tasks"]), scene, digest.hexdigest())
+        return cls(path, episodes, tuple(meta["tasks"]), scene_of(meta), digest.hexdigest())
 
     def check(self, config: RunConfig, scene: Scene) -> None:
         """Raise ``ValueError`` unless a run in a scene can learn from the episodes."""

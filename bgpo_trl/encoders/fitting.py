@@ -350,23 +350,24 @@ def _check_actions(
     Raises:
         ValueError: If more actions are left out.
     """
-    for episodes, most in ((shown, 0.05), (own, 1.0)):
+    for episodes in (shown, own):
         if episodes is None or "action" not in episodes:
             continue
         valid, small = _steps_to_infer(episodes, config)
         left_out = float((valid & ~small).sum() / valid.sum())
-        if left_out > 0.05:
-            component = int(episodes.get("action")[valid & ~small].abs().mean(0).argmax())
-            told = (
-                f"largest_action {config.largest_action} leaves {left_out:.0%} of the actions out, "
-                f"most by component {component}, and the inverse model would never see them: raise "
-                "it (`bgpo encoders --config.inverse.largest-action`, or largest_action of the "
-                "scene), 1 keeps all"
-            )
-            if left_out > most or left_out == 1:
-                raise ValueError(told)
-            if shown is None or "action" not in shown:
-                warnings.warn(f"{told}; or leave it, if demonstrations have none", stacklevel=3)
+        if left_out <= 0.05:
+            continue
+        component = int(episodes.get("action")[valid & ~small].abs().mean(0).argmax())
+        told = (
+            f"largest_action {config.largest_action} leaves {left_out:.0%} of the actions out, "
+            f"most by component {component}, and the inverse model would never see them: raise "
+            "it (`bgpo encoders --config.inverse.largest-action`, or largest_action of the "
+            "scene), 1 keeps all"
+        )
+        if episodes is shown or left_out == 1:
+            raise ValueError(told)
+        if shown is None or "action" not in shown:
+            warnings.warn(f"{told}; or leave it, if demonstrations have none", stacklevel=3)
 
 
 def _train_inverse(latent: Tensor, episodes: TensorDictBase, fit: Fit) -> InverseModel:

@@ -58,9 +58,8 @@ def plot_frame_strips(episodes: Mapping[str, NDArray], n_frames: int = 8) -> Fig
         label = row[0].annotate(
             title, (0, 1), xytext=(0, 11), xycoords="axes fraction", textcoords="offset points"
         )
-        label.set(
-            fontsize=7, in_layout=False, parse_math=False
-        )  # A long title must not widen its column.
+        # A long title must not widen its column; what is between dollars is no formula.
+        label.set(fontsize=7, in_layout=False, parse_math=False)
     return figure
 
 

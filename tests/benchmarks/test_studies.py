@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorDict
 from torch.func import functional_call
 
+from benchmarks.studies import trained
 from benchmarks.studies.cut_demonstrations import Networks, unknown_task
 from benchmarks.studies.gwr_as_published import Arguments, grow
 from benchmarks.studies.trained import POLICIES, Row, summarized
@@ -86,3 +87,23 @@ def test_what_a_policy_has_above_its_clone_is_paired_by_seed():
     assert cells[2] == ["push", "70.0 % in 12.5", "55.0 % in 12.5", "+15.0 [-49, +79]"]
     alone = summarized(pd.DataFrame(rows[:2])).splitlines()
     assert alone[0].strip("| ").split(" | ") == ["task", "as in tests"]
+
+
+@pytest.mark.usefixtures("easy_world")
+def test_the_latest_weights_are_tested_if_asked_for(begin, tmp_path, monkeypatch):
+    begin(tmp_path / "run").run()
+    found, expected = [], []
+
+    def measure(run, episodes, watch):
+        learner = run.algorithm.learner
+        place = torch.zeros((), dtype=torch.int64)
+        for averaged, weights in ((False, expected), (True, found)):
+            weights.append(learner.policy_weights(place, place, averaged=averaged))
+        assert run.algorithm.actor_weights(0).keys() == found[-1].keys()
+        return [Row("as in tests", 3, "grasp_glass", episodes, 1.0, 5.0)]
+
+    monkeypatch.setattr(trained, "measure_trained", measure)
+    for latest in (False, True):
+        trained.trained(trained.WeightsArguments(run=tmp_path / "run", latest=latest))
+    same = [all(a[key].equal(b[key]) for key in a) for a, b in zip(found, expected, strict=True)]
+    assert same == [False, True]
