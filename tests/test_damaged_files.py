@@ -28,7 +28,7 @@ from tests.helpers import POINTER, UNPICKLED, Malice
 
 FILES = [f"{key}.memmap" for key in ("pixels", "state", "action", "length", "task", "train")]
 FILES += ["dataset.json", "meta.json"]
-REMEDIES = ("record it again", "resume it", "train-encoders")
+REMEDIES = ("record it again", "resume it", "train-encoders", "git lfs pull")
 examples = pytest.mark.parametrize("n", [20, pytest.param(1_000, marks=pytest.mark.slow)])
 damages = st.one_of(
     st.tuples(st.just("flip"), st.floats(0, 1, exclude_max=True), st.integers(0, 7)),
@@ -141,6 +141,7 @@ def test_damaged_bytes(written, check, kind, n):
     @given(name=st.sampled_from(names), damage=damages, of_header=st.booleans())
     @example(name=names[-1], damage=("malice", None, None), of_header=False)
     @example(name=names[-2:][0], damage=("folder", None, None), of_header=False)
+    @example(name=names[0], damage=("replace", None, b"version https://git-lfs"), of_header=False)
     @example(name=names[0], damage=("flip", 0.6, 0), of_header=False)
     @example(name=names[0], damage=("flip", 0.999, 0), of_header=False)
     def holds(name, damage, of_header):
