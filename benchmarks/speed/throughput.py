@@ -83,7 +83,7 @@ def measure_updates(arguments: Arguments) -> Table:
     contenders = updates.contenders(arguments.seeds)
     each = _time_each(contenders, arguments.rounds, clock=time.process_time)
     floor = next(name for name in each if name.startswith("floor"))
-    rivals = [name for name in ("TorchRL loop", "Stable-Baselines3") if name in each]
+    rivals = [name for name in each if name.startswith(("TorchRL", "Stable-Baselines3"))]
     return {
         name: {
             "updates a second a seed": 1 / Timing.of(taken).median,
