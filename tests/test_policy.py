@@ -2,7 +2,6 @@
 
 import json
 import pickle
-import runpy
 import shutil
 import subprocess
 import sys
@@ -355,15 +354,6 @@ def test_a_run_on_the_ground_truth_watches_nothing(
 def test_a_seed_that_is_not_in_the_run_is_refused(load, seed):
     with pytest.raises(ValueError, match=f"has no seed {seed!r}: choose one of 3, 8"):
         load(seed=seed)
-
-
-def test_the_one_shot_example_prints_the_recognition_and_the_outcome(trainer_of, capsys):
-    example = runpy.run_path(str(ROOT / "examples" / "one_shot.py"))
-    frames = example["demonstrate"]("push_green_to_white", 4)
-    example["main"](trainer_of("bgpo").directory, task="push_green_to_white", seed=4)
-    seen, outcome = capsys.readouterr().out.splitlines()
-    assert seen == repr(bgpo_trl.load_run(trainer_of("bgpo").directory).condition(frames))
-    assert outcome in ("push_green_to_white: success", "push_green_to_white: no success")
 
 
 def test_the_package_lists_its_names():
