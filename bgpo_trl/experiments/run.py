@@ -34,7 +34,7 @@ from bgpo_trl.runs.demonstrations import load_inputs, own_weights
 from bgpo_trl.runs.directory import holds_run
 from bgpo_trl.runs.growth import Grown, add_task, distinctness
 from bgpo_trl.runs.provenance import command, commit_of_code, versions
-from bgpo_trl.runs.results import read_json
+from bgpo_trl.runs.results import is_finished
 from bgpo_trl.scenes import Scene, find_scene
 from bgpo_trl.training import Trainer
 
@@ -77,7 +77,8 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
     if arguments.resume and (out / "config.json").exists():
         saved, digests = read_config(out / "config.json")
         config = _continued(arguments, config, saved)
-        if arguments.add_task is None and _is_finished(out, config, saved):
+        same = arguments.add_task is None and saved == config
+        if same and is_finished(out, config.episodes):
             return f"{out} is finished, all {config.episodes} episodes: --episodes makes it longer"
     loggers: list[Callable[[], Logger]] = []
     if arguments.wandb is not None:
@@ -158,13 +159,6 @@ def _continued(arguments: Arguments, config: RunConfig, saved: RunConfig) -> Run
     kept = ("task_starts", "eval_every")
     own = {name: getattr(saved, name) for name in kept if not arguments.gives(name)}
     return replace(config, **own)
-
-
-def _is_finished(out: Path, config: RunConfig, saved: RunConfig) -> bool:
-    """Return whether a directory holds a complete run: training, final tests and figures."""
-    if saved != config or not all((out / name).exists() for name in ("final.csv", "summary.json")):
-        return False
-    return read_json(out / "summary.json").get("episodes") == config.episodes
 
 
 def _inputs(

@@ -30,6 +30,7 @@ from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.writing import lock_directory
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.directory import holds_run
+from bgpo_trl.runs.results import is_finished
 from bgpo_trl.scenes import find_scene
 from suites import opengl
 
@@ -51,8 +52,8 @@ class Job:
 
     @property
     def finished(self) -> bool:
-        """Whether the job was run to its end, of which the summary is the mark."""
-        return (self.directory / "summary.json").exists()
+        """Whether the job was run to its end."""
+        return is_finished(self.directory, self.config.episodes)
 
     @property
     def episodes(self) -> int:

@@ -294,6 +294,16 @@ def read_run(directory: str | os.PathLike[str]) -> Run:
     return Run((directory,), config, summary, tests, *others)
 
 
+def is_finished(directory: Path, episodes: int) -> bool:
+    """Return whether a run of so many episodes came to its end, of which its summary is the mark.
+
+    Raises:
+        ValueError: If the summary is damaged.
+    """
+    path = directory / "summary.json"
+    return path.exists() and read_json(path).get("episodes") == episodes
+
+
 def joined(runs: Iterable[Run]) -> list[Run]:
     """Return runs, of which those that differ only in their seeds are one.
 

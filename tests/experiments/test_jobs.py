@@ -69,7 +69,7 @@ def make_play():
             except KeyboardInterrupt:
                 (job.directory / "saved").touch()
                 raise
-        (job.directory / "summary.json").touch()
+        (job.directory / "summary.json").write_text(f'{{"episodes": {job.config.episodes}}}')
 
     return play
 
@@ -119,11 +119,12 @@ def test_a_job_waits_for_the_lock_and_skips_a_finished_run(make_config, tmp_path
     thread.start()
     thread.join(0.3)
     assert thread.is_alive()
-    (job.directory / "summary.json").touch()
+    summary = job.directory / "summary.json"
+    summary.write_text(f'{{"episodes": {job.config.episodes}}}')
     other.communicate("\n")
     thread.join(20)
     assert not thread.is_alive() and not played
-    (job.directory / "summary.json").unlink()
+    summary.unlink()
     jobs.work(job, played.append, sys.argv)
     assert played == [job]
     assert (job.directory / "log.txt").read_text().count(f"process {os.getpid()} on") == 1

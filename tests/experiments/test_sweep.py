@@ -32,7 +32,7 @@ def write_run(job):
     job.directory.mkdir(parents=True, exist_ok=True)
     settings = settings_of(job.config, Digests("some", "bank"))
     (job.directory / "config.json").write_text(json.dumps(settings))
-    (job.directory / "summary.json").write_text("{}")
+    (job.directory / "summary.json").write_text(f'{{"episodes": {job.config.episodes}}}')
 
 
 def test_a_job_is_a_block_of_seeds_of_an_algorithm_in_a_setting(tmp_path):
