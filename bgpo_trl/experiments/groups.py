@@ -15,10 +15,11 @@ from torch import Tensor
 from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.analysis.task_inference import group_counts, group_purity, task_inference_accuracy
 from bgpo_trl.configs import BGPOConfig
+from bgpo_trl.configs.runs import check_seeds
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.experiments.arguments import GroupsArguments
 from bgpo_trl.experiments.run import bank_of
-from bgpo_trl.experiments.settings import check_draws, even_starts
+from bgpo_trl.experiments.settings import even_starts
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.seeding import generators
@@ -81,7 +82,9 @@ def form(
 def groups(arguments: GroupsArguments) -> str:
     """Measure the groups of behaviors that form from demonstrations, as `GroupsArguments` says."""
     torch.set_num_threads(1)
-    check_draws(arguments.seeds, arguments.draws)
+    if arguments.draws < 1:
+        raise ValueError(f"--draws must be at least 1, got {arguments.draws}")
+    check_seeds(arguments.seeds)
     bank, config = bank_of(arguments), BGPOConfig(group_evidence=arguments.group_evidence)
     fine = replace(config.gwr, activity_scale=arguments.activity_scale)
     n_tasks, seen, held_out = len(bank.tasks), bank.seen(), bank.held_out()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,6 @@ import tyro
 
 from bgpo_trl.algorithms import ALGORITHMS, entry
 from bgpo_trl.configs import PRESETS, RunConfig
-from bgpo_trl.configs.runs import check_seeds
 from bgpo_trl.experiments.arguments import SETTINGS, Arguments
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.directory import differing_settings
@@ -130,13 +129,6 @@ def chosen_tasks(tasks: tuple[str, ...] | None, scene: Scene) -> tuple[str, ...]
 def even_starts(n_tasks: int, episodes: int) -> tuple[int, ...]:
     """Return the episodes from which tasks are presented at even intervals."""
     return tuple(position * episodes // n_tasks for position in range(n_tasks))
-
-
-def check_draws(seeds: Sequence[int], draws: int) -> None:
-    """Raise ``ValueError`` if there is nothing to draw, or seeds are missing or repeated."""
-    if draws < 1:
-        raise ValueError(f"--draws must be at least 1, got {draws}")
-    check_seeds(seeds)
 
 
 def changed_hyperparameters(config: RunConfig) -> dict[str, Any]:

@@ -86,8 +86,7 @@ CASES = [
     # measurements
     ("studies/aftermath.py --demonstrators --episodes 0", "--episodes"),
     ("bgpo groups --draws 0", "--draws"),
-    ("studies/unknown_task.py --seeds 0 0", "seeds"),
-    ("studies/unknown_task.py --tasks grasp_glass", "--tasks"),
+    ("bgpo groups --seeds 0 0", "seeds"),
     ("studies/tasks.py --starts 1", "--starts"),
     ("studies/tasks.py --pictures no-such-folder", "no-such-folder"),
     ("speed/throughput.py --parts", "--parts"),
