@@ -26,9 +26,9 @@ import tyro
 from scipy import stats
 from tensordict import TensorDict
 from torch import Tensor
-from torch.nn.functional import one_hot
 
 from bgpo_trl.analysis.tables import Table, markdown
+from bgpo_trl.analysis.task_inference import group_counts, majority_task
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.recording import record_demonstrations
@@ -103,15 +103,12 @@ class Networks:
             known: The same of the bank's, ``[S, M]``.
             task: Tasks of the demonstrations, ``[N]``.
         """
-        labels = one_hot(self.bank.task, len(self.bank.tasks)).double()
-        share = labels / labels.sum(0)
-        right = torch.zeros(node.shape, dtype=torch.bool)
-        for index, (own, of_bank) in enumerate(zip(node, known, strict=True)):
-            size = int(max(own.max(), of_bank.max())) + 1
-            held = torch.zeros(size, share.shape[-1], dtype=share.dtype)
-            held.index_add_(0, of_bank, share)
-            right[index] = (held.argmax(-1)[own] == task) & (held.sum(-1)[own] > 0)
-        return right
+        right = []
+        for own, of_bank in zip(node, known, strict=True):
+            majority = majority_task(group_counts(of_bank, self.bank.task))
+            is_held = own < len(majority)
+            right.append(is_held & (majority[own.where(is_held, 0)] == task))
+        return torch.stack(right)
 
 
 def record(arguments: Arguments, tasks: tuple[str, ...]) -> TensorDict:
