@@ -15,7 +15,6 @@ and prints both as tables of means over seeds.
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,14 +23,13 @@ import pandas as pd
 import torch
 import tyro
 from scipy import stats
-from tensordict import TensorDict
 from torch import Tensor
 
 from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.analysis.task_inference import group_counts, majority_task
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.data.recording import new_demonstrations
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import encode_frames
 from bgpo_trl.files.writing import make_folder
@@ -111,18 +109,6 @@ class Networks:
         return torch.stack(right)
 
 
-def record(arguments: Arguments, tasks: tuple[str, ...]) -> TensorDict:
-    """Record new demonstrations."""
-    with tempfile.TemporaryDirectory() as folder:
-        return record_demonstrations(
-            folder,
-            tasks=tasks,
-            per_task=arguments.per_task,
-            held_out_per_task=0,
-            seed=arguments.recording_seed,
-        ).to_tensordict()
-
-
 def known_tasks(
     networks: Networks, phi: Tensor, task: Tensor, seeds: tuple[int, ...]
 ) -> pd.DataFrame:
@@ -172,7 +158,9 @@ def study(arguments: Arguments) -> str:
     tasks = NICO.all_tasks if arguments.tasks == ("all",) else arguments.tasks
     encoders, bank = load_pretrained(tasks=tasks)
     seen = bank.for_tasks(tasks).seen()
-    new = record(arguments, tasks)
+    new = new_demonstrations(
+        tasks=tasks, per_task=arguments.per_task, seed=arguments.recording_seed
+    )
     latent, length, task = encode_frames(encoders.frame_network, new), new["length"], new["task"]
     embedded = {
         share: encoders.lae.encode(latent, length.mul(share).round().long().clamp(min=1))

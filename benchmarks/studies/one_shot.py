@@ -5,7 +5,6 @@ python benchmarks/studies/one_shot.py runs/continual-bgpo-quick
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -19,7 +18,7 @@ from shared import TrainedArguments, write_measurement
 from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.analysis.task_inference import task_inference_accuracy
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.data.recording import new_demonstrations
 from bgpo_trl.encoders.representation import embed_demonstrations
 from bgpo_trl.evaluation import Evaluator, Snapshot
 from bgpo_trl.experiments.command_line import command_line
@@ -106,17 +105,14 @@ def measure(
         raise ValueError(f"--episodes must be at least 1, got {episodes}")
     tasks, config = policy.tasks, policy.config
     evaluator = Evaluator(config, policy.bank.held_out(), policy.encoders, episodes=episodes)
-    with tempfile.TemporaryDirectory() as folder:
-        shown = record_demonstrations(
-            folder,
-            scene=config.scene,
-            tasks=tasks,
-            per_task=episodes,
-            held_out_per_task=0,
-            spread=config.spread,
-            seed=seed,
-            progress=False,
-        ).to_tensordict()
+    shown = new_demonstrations(
+        scene=config.scene,
+        tasks=tasks,
+        per_task=episodes,
+        spread=config.spread,
+        seed=seed,
+        progress=False,
+    )
     length, tables = shown.get("length").clone(), []
     for share in shares:
         shown["length"] = (share * length).round().long().clamp(min=1)

@@ -126,6 +126,18 @@ def open_dataset(path: Path, meta: Mapping[str, Any]) -> TensorDict:
     return TensorDict(columns, [meta["rows"]])
 
 
+def fill_row(
+    dataset: TensorDict, row: int, episode: Mapping[str, Any], task: int, train: bool
+) -> None:
+    """Write an episode to a row, whose length comes last: a row of length 0 is recorded again."""
+    for key, values in episode.items():
+        values = torch.from_numpy(np.asarray(values).copy())
+        steps = [slice(len(values))] if values.ndim else []  # none of success
+        dataset[key][(row, *steps)] = values
+    dataset["task"][row], dataset["train"][row] = task, train
+    dataset["length"][row] = len(episode["pixels"])
+
+
 def checksum_of(dataset: TensorDict) -> str:
     """Return the digest of all tensors."""
     digest = hashlib.sha256()
@@ -325,14 +337,7 @@ def _write(path: Path, scene: Scene, episodes: Episodes, settings: Mapping[str, 
         for task, some in enumerate(episodes.values()):
             n_shown = len(some) - held_out_per_task
             for number in range(len(some)):
-                for key, values in some[number].items():
-                    if key == "success":
-                        dataset[key][row] = bool(values)
-                        continue
-                    dataset[key][row, : len(values)] = torch.from_numpy(np.asarray(values).copy())
-                dataset["task"][row] = task
-                dataset["train"][row] = number < n_shown
-                dataset["length"][row] = lengths[row]
+                fill_row(dataset, row, some[number], task, number < n_shown)
                 row += 1
         write_json(folder / META, {**meta, "checksum": checksum_of(dataset)})
     return dataset

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
 import warnings
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from operator import index
 from pathlib import Path
 from reprlib import repr as short_repr
@@ -18,6 +19,7 @@ from bgpo_trl.data.dataset import (
     META,
     NUMBERS,
     checksum_of,
+    fill_row,
     layout_of,
     load_demonstrations,
     make_dataset,
@@ -131,7 +133,21 @@ def record_demonstrations(
     if not started:
         write_json(path / META, wanted)
     recorder = _Recorder(scene, env.simulations[0], seed, attempts)
-    _record_rows(dataset, recorder, wanted, progress)
+    missing = torch.nonzero(dataset["length"] == 0).flatten().tolist()
+    bar = progress_bar(
+        "record play" if play else "record demonstrations",
+        missing,
+        shown=progress,
+        total=len(dataset),
+        initial=len(dataset) - len(missing),
+        unit="episode",
+    )
+    for row in bar:
+        task, number = divmod(row, per_task)
+        record = recorder.play if play else recorder.demonstrate
+        dataset["seed"][row] = seed
+        train = number < per_task - held_out_per_task
+        fill_row(dataset, row, record(tasks[task], row), task, train)
     env.close()
     for task, tried in recorder.tried.items():
         if 2 * (succeeded := recorder.succeeded[task]) < tried:
@@ -142,6 +158,16 @@ def record_demonstrations(
             )
     write_json(path / META, {**wanted, "checksum": checksum_of(dataset)})
     return dataset
+
+
+def new_demonstrations(**options: Any) -> TensorDict:
+    """Return demonstrations as of `record_demonstrations`, in memory, of which none is held out.
+
+    Args:
+        **options: Arguments of `record_demonstrations`.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        return record_demonstrations(folder, held_out_per_task=0, **options).to_tensordict()
 
 
 class _Recorder:
@@ -243,29 +269,3 @@ def perform(
             break
     episode = {key: np.stack([moment[key] for moment in moments]) for key in moments[0]}
     return {**episode, "action": np.stack(actions)}, success
-
-
-def _record_rows(
-    dataset: TensorDict, recorder: _Recorder, wanted: Mapping[str, Any], progress: bool
-) -> None:
-    play, per_task = "play" in wanted, wanted["per_task"]
-    missing = torch.nonzero(dataset["length"] == 0).flatten().tolist()
-    bar = progress_bar(
-        "record play" if play else "record demonstrations",
-        missing,
-        shown=progress,
-        total=len(dataset),
-        initial=len(dataset) - len(missing),
-        unit="episode",
-    )
-    for row in bar:
-        task, number = divmod(row, per_task)
-        record = recorder.play if play else recorder.demonstrate
-        episode = record(wanted["tasks"][task], row)
-        for key, values in episode.items():
-            dataset[key][row, : len(values)] = torch.from_numpy(values)
-        dataset["task"][row] = task
-        dataset["seed"][row] = wanted["seed"]
-        dataset["train"][row] = number < per_task - wanted["held_out_per_task"]
-        # Written last, since a row whose length is 0 is recorded again.
-        dataset["length"][row] = len(episode["pixels"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from bgpo_trl.data.film import read_film
-from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.data.recording import new_demonstrations
 from bgpo_trl.experiments.arguments import OneShotArguments, WatchArguments
 from bgpo_trl.figures.frames import plot_frame_strips, save_gif
 from bgpo_trl.figures.style import save_figure
@@ -56,17 +55,9 @@ def demonstrate(
     tasks: Sequence[str], seed: int, spread: float = 1.0, scene: Scene | str = "nico"
 ) -> dict[str, NDArray]:
     """Return a new demonstration of each task, uint8 ``[T, H, W, 3]``."""
-    with tempfile.TemporaryDirectory() as folder:
-        recorded = record_demonstrations(
-            folder,
-            scene=scene,
-            tasks=tasks,
-            per_task=1,
-            held_out_per_task=0,
-            spread=spread,
-            seed=seed,
-            progress=False,
-        ).to_tensordict()
+    recorded = new_demonstrations(
+        scene=scene, tasks=tasks, per_task=1, spread=spread, seed=seed, progress=False
+    )
     pixels, length = recorded.get("pixels").numpy(), recorded.get("length").tolist()
     return {task: pixels[row, : length[row]] for row, task in enumerate(tasks)}
 
