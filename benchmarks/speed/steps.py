@@ -1,12 +1,14 @@
-"""Cost of a training step of each algorithm, interleaved in one process.
+"""Cost of a training step by algorithm, tasks and device, interleaved in one process.
 
     python benchmarks/speed/steps.py bgpo-single bgpo bgpo-experts dist-nll maml
     python benchmarks/speed/steps.py bgpo --tasks 3 8 --played 1500
+    python benchmarks/speed/steps.py bgpo --devices cpu cuda --seeds 10
 
 A step covers all seeds: act, simulate, render and encode while an update, if one is due, runs in a
 background thread, then store. An algorithm's update is due as often as in its runs
-(``update_every``). Before timing, each algorithm trains on all tasks until it has groups and
-updates.
+(``update_every``); updates are timed alone, too. Before timing, each algorithm trains on all tasks
+until it has groups and updates. Simulations run on the CPU whatever the device of the networks;
+the memory is what PyTorch has taken of a GPU at most.
 """
 
 from __future__ import annotations
@@ -19,13 +21,14 @@ from itertools import product
 from typing import Annotated, Literal
 
 import numpy as np
+import torch
 import tyro
 from timing import interleave
 
 from bgpo_trl.algorithms import Algorithm, entry
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.experiments.command_line import command_line
-from bgpo_trl.machine import keep_freed_memory, set_threads
+from bgpo_trl.machine import choose_device, keep_freed_memory, set_threads
 from bgpo_trl.transforms import TaskSchedule
 from bgpo_trl.world import World
 from suites import nico
@@ -45,6 +48,8 @@ class Arguments:
     """Algorithms to compare; ratios are to the first."""
     tasks: tuple[int, ...] = (3,)
     """Numbers of tasks: the first so many of the suite."""
+    devices: tuple[str, ...] = ("cpu",)
+    """Devices of the networks."""
     seeds: int = 5
     """Seeds per batch."""
     played: int = 400
@@ -80,11 +85,19 @@ class Steps:
                 update.result()
             self.algorithm.store(transition)
             self._played += 1
+        _finish()
 
     def update(self, count: int) -> None:
         """Make updates without environment steps."""
         for _ in range(count):
             self.algorithm.update()
+        _finish()
+
+
+def _finish() -> None:
+    """Wait for what was started on a GPU."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
 
 
 def main(arguments: Arguments) -> None:
@@ -93,12 +106,15 @@ def main(arguments: Arguments) -> None:
     keep_freed_memory()
     encoders, bank = load_pretrained(tasks=nico.ALL_TASKS[: max(arguments.tasks)])
     running: dict[str, Steps] = {}
-    for name, n_tasks in product(arguments.algorithms, arguments.tasks):
+    for name, n_tasks, device in product(arguments.algorithms, arguments.tasks, arguments.devices):
         known, seeds = entry(name), range(arguments.seeds)
         seen = bank.for_tasks(nico.ALL_TASKS[:n_tasks]).seen()
-        algorithm = known.make(known.config, seeds=seeds, bank=seen, encoders=encoders)
+        place = choose_device(device)
+        algorithm = known.make(
+            known.config, seeds=seeds, bank=seen, encoders=encoders, device=place
+        )
         world = World(algorithm, seeds=seeds, schedule=TaskSchedule((0,) * n_tasks), bank=seen)
-        key = f"{name}, {n_tasks} tasks"
+        key = f"{name}, {n_tasks} tasks, {device}"
         running[key] = Steps(algorithm, world)
         running[key].play(arguments.played)
 
@@ -120,6 +136,8 @@ def main(arguments: Arguments) -> None:
     print("|---|---|---:|---:|---:|")
     table("play")
     table("update")
+    if torch.cuda.is_available():
+        print(f"{torch.cuda.get_device_name()}: {torch.cuda.max_memory_allocated() / 1e6:.0f} MB")
 
 
 if __name__ == "__main__":
