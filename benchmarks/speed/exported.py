@@ -21,6 +21,7 @@ import torch
 import tyro
 from timing import Timing, interleave, ratio
 
+from bgpo_trl.analysis.tables import markdown
 from bgpo_trl.experiments.arguments import ImportArguments
 from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.machine import set_threads
@@ -92,13 +93,12 @@ def main(arguments: Arguments) -> None:
     policy.condition(frames)
     with tempfile.TemporaryDirectory() as folder:
         times = measure(contenders(policy, Path(folder)), list(frames), arguments.rounds)
-    print("| | ms an action | times TrainedPolicy.act |")
-    print("|---|---:|---:|")
+    rows = [["", "ms an action", "times TrainedPolicy.act"]]
     for name, found in times.items():
-        cells = []
+        rows.append([name])
         for of, unit in ((Timing.of(found), 1e3), (ratio(found, times["TrainedPolicy.act"]), 1)):
-            cells.append(f"{of.median * unit:.2f} ({of.low * unit:.2f}-{of.high * unit:.2f})")
-        print(f"| {name} | {' | '.join(cells)} |")
+            rows[-1].append(f"{of.median * unit:.2f} ({of.low * unit:.2f}-{of.high * unit:.2f})")
+    print(markdown(rows))
 
 
 if __name__ == "__main__":

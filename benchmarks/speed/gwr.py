@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 from timing import Timing, interleave
 from torch import Tensor
 
+from bgpo_trl.analysis.tables import markdown
 from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.machine import set_threads
@@ -136,17 +137,14 @@ def slope(rows: list[dict[str, Any]], call: str) -> float:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Format the measurements in Markdown."""
-    lines = [
-        "| networks | nodes | lookup | adapt | lookup + adapt | read weights | bytes a node |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    cells = [["networks", "nodes", *CALLS, "read weights", "bytes a node"]]
     for row in rows:
-        cells = [
+        times = [
             "{median:.4f} ({low:.4f} to {high:.4f})".format(**row[x]) for x in (*CALLS, "read")
         ]
-        count = f"| {row['networks']} | {row['nodes']:,} |"
-        lines.append(f"{count} {' | '.join(cells)} | {row['bytes_per_node']:.0f} |")
-    return "\n".join(lines)
+        count = [str(row["networks"]), f"{row['nodes']:,}"]
+        cells.append([*count, *times, f"{row['bytes_per_node']:.0f}"])
+    return markdown(cells)
 
 
 def plot(rows: list[dict[str, Any]]) -> Figure:

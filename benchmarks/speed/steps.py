@@ -18,7 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ import tyro
 from timing import interleave
 
 from bgpo_trl.algorithms import Algorithm, entry
+from bgpo_trl.analysis.tables import markdown
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.machine import choose_device, keep_freed_memory, set_threads
@@ -118,24 +119,19 @@ def main(arguments: Arguments) -> None:
         running[key] = Steps(algorithm, world)
         running[key].play(arguments.played)
 
-    def table(what: Literal["play", "update"]) -> None:
+    rows = [["what", "algorithm", "ms", "times the first", "CPU time, times the first"]]
+    for what, described in (("play", "training step"), ("update", "update")):
         calls = {
             name: partial(getattr(steps, what), arguments.steps) for name, steps in running.items()
         }
         wall = interleave(calls, rounds=arguments.rounds)
         cpu = interleave(calls, rounds=arguments.rounds, clock=time.process_time)
         first = next(iter(running))
-        described = "training step" if what == "play" else "update"
         for name in running:
             ms = 1_000 * np.median(wall[name]) / arguments.steps
             ratios = [np.median(np.divide(times[name], times[first])) for times in (wall, cpu)]
-            cells = [f"{ms:.1f}", *(f"{ratio:.2f}" for ratio in ratios)]
-            print(f"| {described} | {name} | {' | '.join(cells)} |")
-
-    print("| what | algorithm | ms | times the first | CPU time, times the first |")
-    print("|---|---|---:|---:|---:|")
-    table("play")
-    table("update")
+            rows.append([described, name, f"{ms:.1f}", *(f"{ratio:.2f}" for ratio in ratios)])
+    print(markdown(rows))
     if torch.cuda.is_available():
         print(f"{torch.cuda.get_device_name()}: {torch.cuda.max_memory_allocated() / 1e6:.0f} MB")
 

@@ -29,6 +29,7 @@ from steps import Steps
 from timing import Timing, interleave, ratio
 
 from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.analysis.tables import markdown
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.experiments.command_line import command_line
@@ -219,19 +220,12 @@ def _resident() -> float:
 def show(table: Table) -> str:
     """Format a table in Markdown."""
     columns = list(dict.fromkeys(column for row in table.values() for column in row))
-    lines = ["| | " + " | ".join(columns) + " |", "|---|" + "---:|" * len(columns)]
-    for name, row in table.items():
-        cells = [row.get(column, "") for column in columns]
-        shown = [
-            f"{c:.0f}"
-            if isinstance(c, float) and c >= 100
-            else f"{c:.2f}"
-            if isinstance(c, float)
-            else c
-            for c in cells
-        ]
-        lines.append(f"| {name} | " + " | ".join(shown) + " |")
-    return "\n".join(lines)
+
+    def cell(value: float | str) -> str:
+        return value if isinstance(value, str) else f"{value:.{0 if value >= 100 else 2}f}"
+
+    rows = [[name, *(cell(row.get(c, "")) for c in columns)] for name, row in table.items()]
+    return markdown([["", *columns], *rows])
 
 
 def main(arguments: Arguments) -> None:
