@@ -209,10 +209,10 @@ def check_conditions(run: Run, other: Run, ignored: Sequence[str] = ()) -> None:
 
 def _conditions(run: Run) -> dict[str, Any]:
     algorithm = run.config.get("algorithm")
-    known: dict[str, Any] = {"eval_every": run.eval_every, "schedule": run.schedule}
+    known = {k: v for k, v in run.config.items() if k not in _OF_THE_RUN}
     if isinstance(algorithm, dict) and "max_steps" in algorithm:
         known["max_steps"] = algorithm["max_steps"]
-    return known | {k: v for k, v in run.config.items() if k not in _OF_THE_RUN}
+    return known
 
 
 def _short(value: Any) -> str:

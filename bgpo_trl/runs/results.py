@@ -14,7 +14,6 @@ import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -177,8 +176,8 @@ class Run:
 
     @property
     def algorithm(self) -> str:
-        """Name of the algorithm; the directory's where ``config.json`` has none."""
-        return self.config.get("name") or self.name
+        """Name of the algorithm."""
+        return self.config["name"]
 
     @property
     def changed(self) -> dict[str, Any]:
@@ -203,7 +202,7 @@ class Run:
     @property
     def schedule(self) -> str:
         """By which of the presented tasks training episodes are drawn; see `RunConfig`."""
-        return self.config.get("schedule", "practised")
+        return self.config["schedule"]
 
     @property
     def presented(self) -> dict[str, int]:
@@ -239,9 +238,7 @@ class Run:
     @property
     def eval_every(self) -> int:
         """Training episodes between tests."""
-        tested = [0, *self.episodes.tolist()]
-        steps = min(after - before for before, after in pairwise(tested))
-        return self.config.get("eval_every") or steps
+        return self.config["eval_every"]
 
     @property
     def unfinished(self) -> str:
@@ -259,13 +256,12 @@ class Run:
 def read_run(directory: str | os.PathLike[str]) -> Run:
     """Read a run; each of its tables once.
 
-    Its directory needs ``config.json`` with seeds, tasks, their starts and the number of episodes.
-
     Raises:
         ValueError: If a file is missing or damaged.
     """
     directory = Path(directory)
-    entries = {"episodes": int, "seeds": list, "tasks": list, "task_starts": list}
+    entries: dict[str, Any] = {"name": str, "schedule": str, "episodes": int, "eval_every": int}
+    entries |= dict.fromkeys(("seeds", "tasks", "task_starts"), list)
     config = read_json(directory / "config.json", entries)
     tasks, starts = config["tasks"], config["task_starts"]
     named = all(isinstance(task, str) for task in tasks)

@@ -52,6 +52,7 @@ def write_run(
     config = {"name": name, "seeds": list(range(len(levels))), "task_starts": list(starts)}
     config |= {"tasks": list(tasks), "episodes": episodes, "eval_every": 2, "eval_episodes": 10}
     config |= {"held_out": "validation", "encoders": "e" * 64, "algorithm": {"max_steps": 50}}
+    config["schedule"] = "practised"
     (path / "config.json").write_text(json.dumps(config | changes))
     told = {"commit": "abc", "command": "python x", "needs_label": name.startswith("maml")}
     (path / "summary.json").write_text(json.dumps(told))

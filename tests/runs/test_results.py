@@ -27,6 +27,7 @@ def test_success_is_read_by_seed_evaluation_and_task(tmp_path):
     rows += [(2, 10, "a", 0), (2, 20, "a", 1), (2, 20, "b", 1), (2, 20, "b", 1)]
     write(tmp_path / "eval.csv", rows)
     config = {"seeds": [2, 7], "tasks": ["a", "b"], "task_starts": [0, 10], "episodes": 20}
+    config |= {"name": "bgpo", "schedule": "practised", "eval_every": 10}
     (tmp_path / "config.json").write_text(json.dumps(config))
     run = read_run(tmp_path)
     assert run.episodes.tolist() == [10, 20]
