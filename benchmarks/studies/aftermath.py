@@ -334,12 +334,10 @@ def episodes_of(arguments: AftermathArguments) -> dict[str, list[Episode]]:
     """Return the test episodes by actor.
 
     Raises:
-        ValueError: If nobody is to act, in no episode, or there is no criterion for a task.
+        ValueError: If nobody is to act, or there is no criterion for a task.
     """
     if arguments.run is None and not arguments.demonstrators:
         raise ValueError("nobody acts: name a run directory, or give --demonstrators")
-    if arguments.episodes < 1:
-        raise ValueError(f"--episodes must be at least 1, got {arguments.episodes}")
     tasks, seeds, spread = nico.ALL_TASKS, arguments.seeds, 1.0
     max_steps = round(TIME_LIMIT / CONTROL_TIMESTEP)
     episodes: dict[str, list[Episode]] = {}

@@ -166,12 +166,7 @@ def measure_looking(
         run: The run.
         episodes: Test episodes of each task and seed.
         watch: Called at each step of the policies, at most ``max_steps + 1`` times a condition.
-
-    Raises:
-        ValueError: If ``episodes`` is less than 1.
     """
-    if episodes < 1:
-        raise ValueError(f"--episodes must be at least 1, got {episodes}")
     config, found = run.config, {}
     held_out = run.bank.held_out(config.held_out)
     for name, hidden in VIEWS.items():
@@ -278,7 +273,7 @@ def looking(arguments: TrainedArguments) -> str:
     directory.
 
     Raises:
-        ValueError: If the run cannot be loaded, or ``episodes`` is less than 1.
+        ValueError: If the run cannot be loaded.
         OSError: If the results cannot be written.
     """
     commit, out = commit_of_code(), arguments.out or arguments.run

@@ -97,12 +97,10 @@ def measure(
     """Return the rows of ``one_shot.csv``; for the arguments see `OneShotArguments`.
 
     Raises:
-        ValueError: If a share is not in (0, 1], or ``episodes`` is less than 1.
+        ValueError: If a share is not in (0, 1].
     """
     if not shares or not all(0 < share <= 1 for share in shares):
         raise ValueError(f"--shares are in (0, 1], got {', '.join(map(str, shares)) or 'none'}")
-    if episodes < 1:
-        raise ValueError(f"--episodes must be at least 1, got {episodes}")
     tasks, config = policy.tasks, policy.config
     evaluator = Evaluator(config, policy.bank.held_out(), policy.encoders, episodes=episodes)
     shown = new_demonstrations(

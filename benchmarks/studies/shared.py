@@ -30,7 +30,11 @@ Actor = Callable[[TimeStep], NDArray]
 
 @dataclass(frozen=True, kw_only=True)
 class TrainedArguments(ImportArguments):
-    """Tests of the policies of a run."""
+    """Tests of the policies of a run.
+
+    Raises:
+        ValueError: If ``episodes`` is less than 1.
+    """
 
     run: tyro.conf.Positional[Path]
     """Run directory."""
@@ -40,6 +44,10 @@ class TrainedArguments(ImportArguments):
     """Folder to write to; the run directory by default."""
     threads: int = 1
     """Threads of PyTorch."""
+
+    def __post_init__(self) -> None:
+        if self.episodes < 1:
+            raise ValueError(f"--episodes must be at least 1, got {self.episodes}")
 
 
 def load_blocks(run: Path) -> list[LoadedRun]:

@@ -93,12 +93,7 @@ def measure_trained(
         run: The run.
         episodes: Test episodes of each task and seed.
         watch: Called at each step of the policies.
-
-    Raises:
-        ValueError: If ``episodes`` is less than 1.
     """
-    if episodes < 1:
-        raise ValueError(f"--episodes must be at least 1, got {episodes}")
     config, rows = run.config, list[Row]()
     held_out = run.bank.held_out(config.held_out)
     evaluator = Evaluator(config, held_out, run.encoders, episodes=episodes)
@@ -130,7 +125,7 @@ def trained(arguments: WeightsArguments) -> str:
     (commit and command) into the run directory.
 
     Raises:
-        ValueError: If the run cannot be loaded, or ``episodes`` is less than 1.
+        ValueError: If the run cannot be loaded.
         OSError: If the results cannot be written.
     """
     commit, out = commit_of_code(), arguments.out or arguments.run
