@@ -8,7 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from bgpo_trl.runs.results import OF_KEEPING, Run, find_table, joined, read_run
+from bgpo_trl.runs.results import OF_KEEPING, Run, joined, read_run
 
 NAMES = {
     "bgpo": "BGPO",
@@ -118,13 +118,9 @@ def read_settings(directories: Sequence[Path]) -> tuple[list[Setting], str]:
     """
     groups: dict[tuple, list[Run]] = {}
     waiting: list[str] = []
-    for directory in directories:
-        if find_table(directory / "eval.csv") is None:
-            waiting.append(f"{directory} holds no test episode")
-            continue
-        run = read_run(directory)
+    for run in map(read_run, directories):
         if run.unfinished:
-            waiting.append(f"{directory} {run.unfinished}")
+            waiting.append(f"{run.directory} {run.unfinished}")
         else:
             kind = (run.tasks, not any(run.starts), _rising(run.starts), run.schedule)
             groups.setdefault(kind, []).append(run)

@@ -1,6 +1,7 @@
 """Wrong command lines: one line or tyro's box, and nothing is written."""
 
 import contextlib
+import json
 import os
 import runpy
 import signal
@@ -29,7 +30,9 @@ def folder(tiny, tmp_path, monkeypatch):
     for name in ("empty", "run", "damaged"):
         (tmp_path / name).mkdir()
     (tmp_path / "file").touch()
-    (tmp_path / "run" / "config.json").write_text('{"episodes": 50, "name": "bgpo"}')
+    config = {"name": "bgpo", "schedule": "practised", "episodes": 50, "eval_every": 1}
+    config |= {"seeds": [0], "tasks": ["grasp_glass"], "task_starts": [0]}
+    (tmp_path / "run" / "config.json").write_text(json.dumps(config))
     (tmp_path / "damaged" / "config.json").write_text('{"episodes": ')
     return tmp_path
 
