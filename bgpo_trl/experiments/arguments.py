@@ -337,8 +337,6 @@ class GroupsArguments(BankArguments):
 
     draws: int = 1_800
     """Demonstrations that each network is shown."""
-    activity_scale: float = BGPOConfig().gwr.activity_scale
-    """Factor of distances in the activity of GWR-B."""
     group_evidence: float = BGPOConfig().group_evidence
     """Depth of the valley of density between two groups, as --algorithm.group-evidence of a run."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -86,7 +85,6 @@ def groups(arguments: GroupsArguments) -> str:
         raise ValueError(f"--draws must be at least 1, got {arguments.draws}")
     check_seeds(arguments.seeds)
     bank, config = bank_of(arguments), BGPOConfig(group_evidence=arguments.group_evidence)
-    fine = replace(config.gwr, activity_scale=arguments.activity_scale)
     n_tasks, seen, held_out = len(bank.tasks), bank.seen(), bank.held_out()
     forward = even_starts(n_tasks, arguments.draws)
     schedules = {
@@ -106,7 +104,7 @@ def groups(arguments: GroupsArguments) -> str:
             formed, needed, seconds = form(seen, rows, config)
             shared.update(sharing(formed.lookup(held_out.embedding).group, held_out.task))
             (random,) = generators([seed], "gwr")
-            gwr = GWRB(seen.embedding.shape[-1], fine, generator=random)
+            gwr = GWRB(seen.embedding.shape[-1], config.gwr, generator=random)
             for row in rows:
                 gwr.adapt(seen.embedding[row])
             inferred = task_inference_accuracy(gwr, seen, held_out)
