@@ -369,7 +369,7 @@ def aftermath(arguments: AftermathArguments) -> str:
         OSError: If the results cannot be written.
     """
     commit = commit_of_code()
-    set_threads(arguments.threads)
+    set_threads(1)
     out = arguments.out or arguments.run or Path("runs/aftermath")
     check_folder(out)
     episodes = episodes_of(arguments)

@@ -277,7 +277,7 @@ def looking(arguments: TrainedArguments) -> str:
         OSError: If the results cannot be written.
     """
     commit, out = commit_of_code(), arguments.out or arguments.run
-    set_threads(arguments.threads)
+    set_threads(1)
     opengl.check()  # before the progress bar
     runs, rows = load_blocks_of_nico(arguments.run), list[Row]()
     check_folder(out)

@@ -181,7 +181,7 @@ def one_shot(arguments: OneShotArguments) -> str:
         OSError: If the results cannot be written.
     """
     commit, out = commit_of_code(), arguments.out or arguments.run
-    set_threads(arguments.threads)
+    set_threads(1)
     policy = load_run(arguments.run)
     check_folder(out)
     tested = measure(policy, arguments.shares, arguments.episodes, arguments.seed)

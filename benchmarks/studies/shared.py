@@ -42,8 +42,6 @@ class TrainedArguments(ImportArguments):
     """Test episodes per task and seed, in each condition."""
     out: Path | None = None
     """Folder to write to; the run directory by default."""
-    threads: int = 1
-    """Threads of PyTorch."""
 
     def __post_init__(self) -> None:
         if self.episodes < 1:

@@ -129,7 +129,7 @@ def trained(arguments: WeightsArguments) -> str:
         OSError: If the results cannot be written.
     """
     commit, out = commit_of_code(), arguments.out or arguments.run
-    set_threads(arguments.threads)
+    set_threads(1)
     runs, rows = load_blocks(arguments.run), list[Row]()
     check_folder(out)
     for run in runs:
