@@ -57,10 +57,9 @@ def _begin(arguments: Arguments) -> RunConfig:
     """Return the settings that flags change: of a run to be resumed, of a file, or a preset's."""
     path, preset = arguments.config, PRESETS[arguments.preset or "quick"]
     if path is None:
-        out = named_directory(arguments)
-        stored = arguments.resume and arguments.preset is None and out is not None
-        path = out / "config.json" if stored and out is not None else None
-        if path is None or not path.exists():
+        path = named_directory(arguments)
+        stored = arguments.resume and arguments.preset is None
+        if not stored or path is None or not (path / "config.json").exists():
             return replace(preset, algorithm=ALGORITHMS[preset.name].config)
     path = path / "config.json" if path.is_dir() else path
     if not path.exists():
