@@ -143,7 +143,7 @@ def record_demonstrations(
         unit="episode",
     )
     for row in bar:
-        task, number = divmod(row, per_task)
+        task, number = divmod(int(row), per_task)
         record = recorder.play if play else recorder.demonstrate
         dataset["seed"][row] = seed
         train = number < per_task - held_out_per_task
