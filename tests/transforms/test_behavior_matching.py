@@ -2,7 +2,14 @@
 
 import pytest
 import torch
-from torchrl.envs import Compose, RenameTransform, RewardSum, TransformedEnv, check_env_specs
+from torchrl.envs import (
+    Compose,
+    RenameTransform,
+    RewardSum,
+    SerialEnv,
+    TransformedEnv,
+    check_env_specs,
+)
 
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.transforms import BehaviorMatchingReward, FrameEncoder
@@ -72,6 +79,17 @@ def test_wrong_orders_are_refused():
     with pytest.raises(ValueError, match=refusal):
         reset(Compose(behavior(), RewardSum()), bonus())
     reset(behavior(), Compose(bonus(), RewardSum()))
+
+
+@pytest.mark.parametrize("use_buffers", [True, False])
+def test_each_worker_can_have_a_composition_of_its_own(use_buffers):
+    workers = [lambda: make_env(lengths=9), lambda: make_env(lengths=4)]
+    env = SerialEnv(2, workers, use_buffers=use_buffers)
+    check_env_specs(env)
+    together, _ = play(env, 12)
+    alone, _ = play(make_env(lengths=4), 12)
+    for key, value in together[1].items(True, True):
+        torch.testing.assert_close(alone[key], value)
 
 
 def test_rows_that_are_not_stepped_keep_their_embedding():

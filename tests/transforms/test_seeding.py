@@ -88,15 +88,6 @@ def test_a_state_loaded_after_the_seed_was_set_is_kept():
         assert env.reset()[key].equal(other.reset()[key])
 
 
-def test_a_copy_draws_as_the_original_does():
-    env = compose((2,), max_steps=2)
-    env.set_seed(7)
-    rollout(env, 3)
-    other = copy.deepcopy(env)
-    for _ in range(2):
-        assert_equal(rollout(env, 5), rollout(other, 5))
-
-
 def test_environments_side_by_side_draw_differently():
     env = SerialEnv(2, [compose, compose])
     env.set_seed(0)
