@@ -1,7 +1,6 @@
 """Tasks from outside the suite: from their registration to their rows in a run's CSV files."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -35,12 +34,6 @@ def bank_of(*tasks, n=6):
     task = torch.arange(len(tasks)).repeat_interleave(n)
     embedding = torch.stack([task.float(), torch.arange(len(task)).float()], -1)
     return DemonstrationBank(embedding, task, torch.arange(len(task)) % 3 > 0, tasks)
-
-
-def names_and_embeddings(bank):
-    return [
-        (bank.tasks[t], *phi) for t, phi in zip(bank.task, bank.embedding.tolist(), strict=True)
-    ]
 
 
 def test_an_added_task_can_be_loaded_by_name():
@@ -93,26 +86,6 @@ def test_a_run_is_resumed_with_its_demonstrations_from_whatever_module(
         pass  # Demonstrations of tasks that are not in the run do not matter.
     with pytest.raises(ValueError, match="other settings"):
         begin(tmp_path, config, bank=bank_of("at_once", n=7), **parts)
-
-
-def test_a_bank_selects_and_labels_tasks_by_name():
-    bank = bank_of("a", "b", "c", n=2)
-    chosen = bank.for_tasks(["c", "a"])
-    assert chosen.tasks == ("c", "a")
-    assert chosen.task.tolist() == [1, 1, 0, 0]
-    assert names_and_embeddings(chosen) == [("a", 0, 0), ("a", 0, 1), ("c", 2, 4), ("c", 2, 5)]
-    assert chosen.train.tolist() == [False, True, True, True]
-    assert names_and_embeddings(chosen.seen()) == names_and_embeddings(chosen)[1:]
-    with pytest.raises(ValueError, match="no demonstration of 'd'"):
-        bank.for_tasks(["a", "d"])
-    with pytest.raises(ValueError, match="task label 1"):
-        replace(bank, tasks=("a",))
-
-
-def test_banks_are_joined_by_the_names_of_their_tasks():
-    joined = bank_of("a", "b", n=1) + bank_of("c", "b", n=1)
-    assert joined.tasks == ("a", "b", "c")
-    assert names_and_embeddings(joined) == [("a", 0, 0), ("b", 1, 1), ("c", 0, 0), ("b", 1, 1)]
 
 
 @pytest.mark.parametrize("task", ["juggle", "at_once"])

@@ -89,22 +89,29 @@ def with_steps(steps):
     )
 
 
-def test_steps_go_with_their_demonstrations(with_steps):
-    steps = with_steps.steps
-    for part, rows in (
-        (with_steps.seen(), [0, 2, 3]),
-        (with_steps.held_out(), [1, 4]),
-        (with_steps.of_task(0), [0, 3]),
-        (with_steps.for_tasks(with_steps.tasks[2:]), [2]),
-        (with_steps.of_task(2) + with_steps.seen(), [2, 0, 2, 3]),
+def test_steps_and_names_of_tasks_go_with_their_demonstrations(with_steps):
+    steps, every = with_steps.steps, with_steps.tasks
+    for part, rows, tasks in (
+        (with_steps.seen(), [0, 2, 3], every),
+        (with_steps.held_out(), [1, 4], every),
+        (with_steps.of_task(0), [0, 3], every),
+        (with_steps.for_tasks(every[2::-2]), [0, 2, 3], every[2::-2]),
+        (with_steps.for_tasks(every[2:]) + with_steps.seen(), [2, 0, 2, 3], (every[2], *every[:2])),
     ):
         assert part.embedding.equal(with_steps.embedding[rows])
         assert part.train.equal(with_steps.train[rows])
+        assert part.tasks == tasks
+        names = [every[label] for label in with_steps.task[rows]]
+        assert [tasks[label] for label in part.task] == names
         for row, origin in enumerate(rows):
             ours, theirs = frames(part.steps, row), frames(steps, origin)
             assert part.steps.latents(ours).equal(steps.latents(theirs))
             assert part.steps.actions(ours).equal(steps.actions(theirs))
     assert (with_steps + replace(with_steps, steps=None)).steps is None
+    with pytest.raises(ValueError, match="no demonstration of 'juggle'"):
+        with_steps.for_tasks(["juggle"])
+    with pytest.raises(ValueError, match="task label 1"):
+        replace(with_steps, tasks=every[:1])
 
 
 def test_the_halves_of_the_held_out_ones_take_turns_and_are_all_of_them(bank):
