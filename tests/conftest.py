@@ -93,21 +93,24 @@ def bank():
 
 @pytest.fixture(scope="session")
 def make_config():
-    """Make the settings of a run of two seeds and 10 episodes, with some of them changed."""
+    """Make the settings of a run of two seeds and 10 episodes, with some of them changed.
 
-    def make(state="latent", name="bgpo", **changes):
+    Those of its algorithm and of this one's networks and updates are changed by name.
+    """
+
+    def make(state="latent", name="bgpo", *, rl=None, algorithm=None, **changes):
         small = {"hidden_sizes": (64,), "batch_size": 16, "warmup_steps": 8, "replay_size": 200}
         small |= {"clone_episodes": 2}
         # Demonstrations are latents; without noise, a test can identify them among other data.
         share = 0.25 if entry(name).config.demonstration_share and state == "latent" else 0.0
         if not share:
             small["proposals"] = "actor"
-        rl = replace(entry(name).config.rl, **small)
+        rl = replace(entry(name).config.rl, **{**small, **(rl or {})})
         settings = {"state": state, "max_steps": 6, "rl": rl, **of_name(SMALL, name)}
         settings |= {"demonstration_share": share, "demonstration_noise": 0.0}
         if isinstance(entry(name).config, BGPOConfig):
             settings |= {"expert_batch_size": 8, "group_size": 4}
-        algorithm = replace(entry(name).config, **settings)
+        algorithm = replace(entry(name).config, **{**settings, **(algorithm or {})})
         config = RunConfig(
             seeds=(3, 8),
             episodes=10,

@@ -172,6 +172,22 @@ def interrupt_call(trainer: Trainer, owner: object, name: str, n: int) -> None:
         trainer.run()
 
 
+def spied(owner: Any, name: str, patch: pytest.MonkeyPatch | None = None) -> list[Any]:
+    """Have a method keep its calls; return the list of their copied arguments and results.
+
+    Without ``patch``, it does so as long as its owner lives.
+    """
+    calls, method = [], getattr(owner, name)
+
+    def call(*arguments: Any, **options: Any) -> Any:
+        given = [each.clone() if hasattr(each, "clone") else each for each in arguments]
+        calls.append((given, method(*arguments, **options)))
+        return calls[-1][1]
+
+    (patch.setattr if patch else setattr)(owner, name, call)
+    return calls
+
+
 class Recorder(Logger):
     """Logger that keeps what it gets, in place of a service.
 

@@ -1,16 +1,11 @@
 """Runs that `test_resume` starts in separate processes and kills; imports only what they need."""
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
 
-from bgpo_trl.configs import (
-    InverseModelConfig,
-    RepresentationConfig,
-    SequenceAutoencoderConfig,
-    VAEConfig,
-)
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders import probes
 from bgpo_trl.encoders.train import train_encoders
@@ -18,15 +13,13 @@ from bgpo_trl.scenes import SCENES
 from bgpo_trl.scenes.nico import NICO
 from bgpo_trl.training import Trainer
 from tests.conftest import EASY
+from tests.helpers import TINY_ENCODERS
 
 RECORDING = {"per_task": 2, "held_out_per_task": 1}
-ENCODERS = RepresentationConfig(
-    vae=VAEConfig(batch_size=4, window=2, steps=20, warmup_steps=1),
-    lae=SequenceAutoencoderConfig(batch_size=4, steps=20, warmup_steps=1),
-    inverse=InverseModelConfig(hidden_size=8, batch_size=8, steps=20, warmup_steps=1),
-    checkpoint_every=3,
-    log_every=1,
-)
+LONGER = {
+    name: replace(getattr(TINY_ENCODERS, name), steps=20) for name in ("vae", "lae", "inverse")
+}
+ENCODERS = replace(TINY_ENCODERS, **LONGER, checkpoint_every=3, log_every=1)
 
 
 def play(directory, parts):

@@ -32,7 +32,6 @@ from bgpo_trl.objectives.supervised import (
 )
 from bgpo_trl.runs.results import read_json, read_run
 from bgpo_trl.scenes.nico import NicoEnv
-from bgpo_trl.training import Trainer
 from bgpo_trl.transforms import (
     BehaviorLookup,
     BehaviorMatchingReward,
@@ -213,9 +212,8 @@ def test_a_bad_file_is_refused_and_nothing_changes(tmp_path, refused, call, caus
     refused(lambda: call(tmp_path), cause, remedy)
 
 
-def test_a_policy_that_has_diverged_ends_the_run_in_one_line(make_config, bank, tmp_path, encoders):
-    config = make_config(state="state", name="ddpg")
-    trainer = Trainer(config, tmp_path / "run", bank=bank, encoders=encoders, progress=False)
+def test_a_policy_that_has_diverged_ends_the_run_in_one_line(begin, make_config, tmp_path):
+    trainer = begin(tmp_path / "run", make_config("state", "ddpg"))
     for parameter in trainer.algorithm.learner.loss.parameters():
         parameter.data.fill_(NAN)
     with pytest.raises(ValueError, match="diverged"):

@@ -11,6 +11,7 @@ import torch
 from bgpo_trl.algorithms import entry
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.training import Trainer
+from tests.helpers import spied
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "bgpo_minimal.py"
 OF_RL = ("hidden_sizes", "batch_size", "replay_size", "warmup_steps")
@@ -57,14 +58,14 @@ def small(example):
 def minimal(example, small, encoders, bank):
     """The example after training, with its calls of these methods."""
     bgpo = example.MinimalBGPO(small, encoders, bank)
-    record(bgpo, "store", "update", "inputs", "test")
+    bgpo.calls = {name: spied(bgpo, name) for name in ("store", "update", "inputs", "test")}
     bgpo.train()
     return bgpo
 
 
 @pytest.fixture(scope="module")
 def library(small, encoders, bank, tmp_path_factory):
-    """A run of `bgpo-single` with the same settings."""
+    """A run of `bgpo-single` with the same settings, and its transitions and evaluations."""
     defaults = entry("bgpo-single").config
     config = replace(
         defaults,
@@ -84,26 +85,9 @@ def library(small, encoders, bank, tmp_path_factory):
     )
     directory = tmp_path_factory.mktemp("library")
     with Trainer(run, directory, bank=bank, encoders=encoders, progress=False) as trainer:
-        record(trainer.algorithm, "store")
-        record(trainer.evaluator, "run")
+        stored, tested = spied(trainer.algorithm, "store"), spied(trainer.evaluator, "run")
         trainer.run()
-    return trainer
-
-
-def record(owner, *names):
-    """Keep arguments and results of an object's methods in its attribute ``calls``."""
-    owner.calls = {name: [] for name in names}
-
-    def recorded(name, method):
-        def call(*arguments, **options):
-            copies = [a.clone() if hasattr(a, "clone") else a for a in arguments]
-            owner.calls[name].append((copies, method(*arguments, **options)))
-            return owner.calls[name][-1][1]
-
-        return call
-
-    for name in names:
-        setattr(owner, name, recorded(name, getattr(owner, name)))
+    return trainer.algorithm, stored, tested
 
 
 def assert_close(ours, theirs, atol=1e-6):
@@ -121,7 +105,7 @@ def test_defaults_are_those_of_bgpo_single(example):
 
 def test_transitions_are_those_of_the_library(minimal, library, small):
     ours = torch.stack([arguments[0] for arguments, _ in minimal.calls["store"]])
-    theirs = torch.cat([arguments[0] for arguments, _ in library.algorithm.calls["store"]])
+    theirs = torch.cat([arguments[0] for arguments, _ in library[1]])
     assert len(ours) == len(theirs) > 100
     for key in STORED.values():
         # Actions that differ by rounding can change a pixel by one of its 255 levels.
@@ -140,7 +124,7 @@ def test_weights_are_those_of_the_library(minimal, library, network):
     """Hence also the losses of all updates."""
     assert len(minimal.calls["update"]) > 80
     name = network.replace("actor", "actor_network").replace("critic", "value_network")
-    theirs = library.algorithm.learner.loss.get_submodule(f"{name}_params")
+    theirs = library[0].learner.loss.get_submodule(f"{name}_params")
     theirs = dict(theirs.flatten_keys(".").items())
     linear = [layer for layer in getattr(minimal, network) if isinstance(layer, torch.nn.Linear)]
     assert len(theirs) == 2 * len(linear)
@@ -150,14 +134,14 @@ def test_weights_are_those_of_the_library(minimal, library, network):
 
 
 def test_behaviors_are_those_of_the_library(minimal, library):
-    ours, theirs = minimal.gwr.graph(), library.algorithm.gwr.graph(0)
+    ours, theirs = minimal.gwr.graph(), library[0].gwr.graph(0)
     assert len(ours.node) > 4
     for mine, other in zip(ours, theirs, strict=True):
         assert mine.equal(other)
 
 
 def test_tests_are_those_of_the_library(minimal, library, small):
-    results = [result for _, result in library.evaluator.calls["run"]]
+    results = [result for _, result in library[2]]
     inputs = [given for given, _ in minimal.calls["inputs"] if given[0].ndim == 3]  # of tests
     assert max(latent.abs().max() for latent, _ in inputs) <= torch.tensor(small.state_limit)
     contexts = torch.stack([result.snapshots[0].policy.context for result in results])

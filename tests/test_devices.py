@@ -16,7 +16,6 @@ from bgpo_trl.encoders.fitting import train_representation
 from bgpo_trl.encoders.mismatch import doubt_frames
 from bgpo_trl.encoders.representation import load_representation, save_representation
 from bgpo_trl.modules.frame_network import FRAME_NETWORKS, FrameNetwork
-from bgpo_trl.training import Trainer
 from tests.helpers import TINY_ENCODERS, rows
 from tests.second_device import second_device
 
@@ -50,12 +49,11 @@ def test_colors_are_doubted_wherever_the_network_is(device, encoders):
 
 @pytest.mark.usefixtures("easy_world")
 @pytest.mark.parametrize("name", ["bgpo", *LONGER])
-def test_a_run_is_the_same_on_every_device(device, name, bank, encoders, make_config, tmp_path):
+def test_a_run_is_the_same_on_every_device(device, name, begin, encoders, make_config, tmp_path):
     config = make_config(name=name, episodes=16 if name in LONGER else 6, eval_every=3)
-    parts = {"bank": bank, "encoders": encoders, "progress": False}
     try:
         for folder, place in (("here", "cpu"), ("there", device)):
-            Trainer(config, tmp_path / folder, device=place, **parts).run()
+            begin(tmp_path / folder, config, device=place).run()
     finally:
         encoders.frame_network.cpu()
     assert any(float(row["loss_value"]) > 0 for row in rows(tmp_path / "here" / "train.csv"))

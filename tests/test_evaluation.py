@@ -18,7 +18,7 @@ from bgpo_trl.seeding import stream_seed
 from bgpo_trl.transforms import TaskSchedule
 from suites import nico
 from tests.algorithms.playing import assert_same
-from tests.helpers import DISTINCT
+from tests.helpers import DISTINCT, spied
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 SEEDS = (3, 8)
@@ -131,16 +131,7 @@ def test_test_episodes_equal_a_plain_loop_over_one_environment(
     episodes = 4
     algorithm, evaluator = make(state, name, episodes=episodes)
     turn(algorithm)
-    act, actions = Policy.act, []
-    monkeypatch.setattr(Policy, "act", lambda *args: actions.append(act(*args)) or actions[-1])
-    embeddings = []
-    copy_policy = algorithm.snapshot
-
-    def spy(index, embedding, *args):
-        embeddings.append(embedding)
-        return copy_policy(index, embedding, *args)
-
-    monkeypatch.setattr(algorithm, "snapshot", spy)
+    acted, copied = spied(Policy, "act", monkeypatch), spied(algorithm, "snapshot")
     snapshots = take(evaluator, algorithm, number=5)
     result = evaluator.run(snapshots)
 
@@ -149,7 +140,8 @@ def test_test_episodes_equal_a_plain_loop_over_one_environment(
         starts = rng.integers(2**32, size=(3, episodes))
         for task in range(3):
             for episode in range(episodes):
-                phi = embeddings[index][task, episode]
+                (_, embedding, *_), _ = copied[index]
+                phi = embedding[task, episode]
                 policy = plain_policy(algorithm, snapshots[index], index, task, episode, phi)
                 env = easy_world(
                     seed=[int(starts[task, episode])],
@@ -163,8 +155,8 @@ def test_test_episodes_equal_a_plain_loop_over_one_environment(
                     else:
                         seen = algorithm.world.env.transform[0].forward(now.clone())["state"]
                     action = policy(seen.clamp(-5, 5))
-                    taken = actions[steps * len(SEEDS) + index][task, episode]  # seed by seed
-                    torch.testing.assert_close(taken, action, rtol=1e-3, atol=1e-3)
+                    _, taken = acted[steps * len(SEEDS) + index]  # seed by seed
+                    torch.testing.assert_close(taken[task, episode], action, rtol=1e-3, atol=1e-3)
                     now = env.step(now.set("action", action))["next"]
                     steps += 1
                     success = bool(now["terminated"])
@@ -193,16 +185,6 @@ def test_contexts_are_behaviors_of_held_out_demonstrations(make, bank):
             phi = phi.expand(2, 3, EPISODES, 32)
             assert (4 * context[index]).equal(algorithm.gwr.lookup(phi).embedding[index])
     assert len(drawn) == 12  # in time, all of them
-
-
-def test_the_context_of_the_oracle_is_the_label_and_others_have_none(make):
-    algorithm, evaluator = make("state", "oracle")
-    expected = torch.eye(3).repeat_interleave(EPISODES, 0).view(3, EPISODES, 3)
-    for snapshot in take(evaluator, algorithm):
-        assert snapshot.policy.context.equal(expected)
-    for name in ("ddpg", "maml", "dist-nll"):
-        algorithm, evaluator = make("state", name)
-        assert all(s.policy.context is None for s in take(evaluator, algorithm))
 
 
 @every_kind

@@ -16,7 +16,7 @@ from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.logged import replay_logged
 from bgpo_trl.modules.group_trials import GroupTrials
 from bgpo_trl.scenes.nico import NICO
-from tests.helpers import finish, interrupt, interrupt_call, rows
+from tests.helpers import finish, interrupt, interrupt_call, rows, spied
 from tests.scenes.dot import scene as dot_scene
 from tests.test_training import assert_same_run
 
@@ -102,9 +102,8 @@ def test_the_replay_holds_the_log(learned, encoders: Representation, bank):
     assert (indices[0] != indices[1]).any()
 
 
-def test_a_failure_ends_as_a_timeout_of_the_algorithm(learned, logged_config):
-    config = replace(logged_config().algorithm, timeouts_bootstrap=False)
-    held, _ = learned(algorithm=config).replay.contents(0)
+def test_a_failure_ends_as_a_timeout_of_the_algorithm(learned):
+    held, _ = learned(algorithm={"timeouts_bootstrap": False}).replay.contents(0)
     assert torch.equal(held["next", "terminated"], held["next", "done"])
     assert held["next", "done"].flatten().nonzero().flatten().tolist() == [2, 4, 5, 11]
 
@@ -135,16 +134,9 @@ def test_a_run_learns_from_the_log_before_its_own_episodes(begin, logged_config,
     config = logged_config(offline_updates=4, seeds=(3,))
     logged = torch.from_numpy(np.concatenate([one["action"] for one in EPISODES]))
     with begin(tmp_path / "run", config, logged=log) as trainer:
-        learn, batches = trainer.algorithm.learner.learn, []
-
-        def watch(batch):
-            batches.append(batch)
-            return learn(batch)
-
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(trainer.algorithm.learner, "learn", watch)
-            interrupt(trainer, N_STEPS + 1)
-    for batch in batches[:4]:  # 8 rows, of which a quarter is of demonstrations
+        learned = spied(trainer.algorithm.learner, "learn")
+        interrupt(trainer, N_STEPS + 1)
+    for (batch,), _ in learned[:4]:  # 8 rows, of which a quarter is of demonstrations
         known = (batch["action"][0, 0, :, None] == logged).all(-1).any(-1)
         assert known.tolist() == [True] * 6 + [False] * 2
         assert (batch["priority_weight"] == 1).all()
@@ -154,11 +146,8 @@ def test_a_run_learns_from_the_log_before_its_own_episodes(begin, logged_config,
     assert int(train[0]["env_steps"]) == int(train[0]["steps"])
 
 
-@pytest.mark.parametrize("offline_updates", [0, 3])
-def test_an_interrupted_run_equals_one_that_is_not(
-    begin, logged_config, log, tmp_path, offline_updates
-):
-    config = logged_config(offline_updates=offline_updates)
+def test_an_interrupted_run_equals_one_that_is_not(begin, logged_config, log, tmp_path):
+    config = logged_config(offline_updates=3)
     finish(begin(tmp_path / "straight", config, logged=log))
     run = tmp_path / "run"
     trainer = begin(run, config, logged=log)
@@ -185,13 +174,13 @@ def test_seeds_alone_equal_seeds_of_a_batch(begin, logged_config, log, tmp_path)
         torch.testing.assert_close(value, second[key], rtol=0, atol=1e-5)
 
 
-GROUND_TRUTH = {"state": "state", "demonstration_share": 0.0}
+GROUND_TRUTH = {"algorithm": {"state": "state", "demonstration_share": 0.0}}
 GROUND_TRUTH |= {"rl": {"proposals": "actor", "imitation": 0.0}}
 DOT = {"left": [episode(2, success=True, shape=(16, 24), size=1)]}
 
 
 @pytest.mark.parametrize(
-    ("log", "algorithm", "cause", "remedy"),
+    ("log", "changes", "cause", "remedy"),
     [
         (DOT, {}, "is of the scene dot dot-1", "take what is of 'nico'"),
         ({LATER: LOG[PUSH]}, {}, f"episodes of ['{LATER}']", "task_starts"),
@@ -202,13 +191,11 @@ DOT = {"left": [episode(2, success=True, shape=(16, 24), size=1)]}
     ],
 )
 def test_a_log_that_does_not_fit_is_refused(
-    begin, logged_config, tmp_path, refused, log, algorithm, cause, remedy
+    begin, logged_config, tmp_path, refused, log, changes, cause, remedy
 ):
-    config = logged_config()
-    rl = replace(config.algorithm.rl, **algorithm.get("rl", {}))
-    config = replace(config, algorithm=replace(config.algorithm, **{**algorithm, "rl": rl}))
     write_logged_episodes(tmp_path / "log", log, scene=dot_scene() if log is DOT else "nico")
-    refused(partial(begin, tmp_path / "run", config, logged=tmp_path / "log"), cause, remedy)
+    call = partial(begin, tmp_path / "run", logged_config(**changes), logged=tmp_path / "log")
+    refused(call, cause, remedy)
 
 
 @pytest.mark.parametrize(

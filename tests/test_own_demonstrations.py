@@ -1,7 +1,5 @@
 """Demonstrations without actions, from arrays to a run; in a scene that has no demonstrator."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -58,11 +56,11 @@ def made(tmp_path, monkeypatch):
 
 
 def config_of(make_config, share):
-    config = make_config(scene="dot", tasks=TASKS, task_starts=(0, 2), episodes=4, seeds=(3,))
-    rl = config.algorithm.rl
+    changes = {"algorithm": {"demonstration_share": share}}
     if not share:
-        rl = replace(rl, proposals="actor", imitation=0.0)
-    return replace(config, algorithm=replace(config.algorithm, demonstration_share=share, rl=rl))
+        changes["rl"] = {"proposals": "actor", "imitation": 0.0}
+    run = {"scene": "dot", "tasks": TASKS, "task_starts": (0, 2), "episodes": 4, "seeds": (3,)}
+    return make_config(**run, **changes)
 
 
 def test_demonstrations_without_actions_train_encoders_and_runs(

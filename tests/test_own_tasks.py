@@ -11,7 +11,6 @@ from tensordict import TensorDict
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.evaluation import evaluate_random_policy
 from bgpo_trl.scenes.nico import NicoEnv
-from bgpo_trl.training import Trainer
 from suites import nico
 from tests.helpers import finish
 
@@ -90,9 +89,9 @@ def test_a_run_is_resumed_with_its_demonstrations_from_whatever_module(
 
 @pytest.mark.parametrize("task", ["juggle", "at_once"])
 def test_a_run_of_a_task_unknown_or_never_shown_is_refused_before_it_writes(
-    make_config, tmp_path, task
+    begin, make_config, tmp_path, task
 ):
     config = make_config("state", "oracle", tasks=(task,), task_starts=(0,))
     with pytest.raises(ValueError, match=f"'{task}'"):
-        Trainer(config, tmp_path / "run", bank=bank_of(*nico.PAPER_TASKS), progress=False)
+        begin(tmp_path / "run", config, bank=bank_of(*nico.PAPER_TASKS), encoders=None)
     assert list(tmp_path.iterdir()) == []

@@ -5,7 +5,7 @@ import pickle
 import shutil
 import subprocess
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,6 @@ import torch
 
 import bgpo_trl
 from bgpo_trl import training
-from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.representation import save_representation
@@ -29,7 +28,6 @@ ROOT = Path(__file__).parents[1]
 TASKS = nico.PAPER_TASKS
 LABELED = ("oracle-demonstrations", "maml-demonstrations", "dist-nll-demonstrations")
 NAMES = ("bgpo", "bgpo-single", "without-gwr", "ewc", *LABELED)
-METADATA = {"scene": NICO.identity, "config": json.dumps(asdict(RepresentationConfig()))}
 every_kind = pytest.mark.parametrize("name", NAMES)
 
 
@@ -73,7 +71,7 @@ def trainer_of(encoders, tested_bank, make_config, easy_world, tmp_path_factory)
             config = make_config(name=name, episodes=10 + 6 * (name in LABELED), eval_every=99)
             directory = tmp_path_factory.mktemp(name) / "run"
             weights = directory / "encoders" / "encoders.safetensors"
-            save_representation(replace(encoders, metadata=METADATA), weights)
+            save_representation(encoders, weights)
             replace(tested_bank, encoder_id=encoders.identity).save(bank_path(weights))
             parts = {"bank": tested_bank, "encoders": encoders, "progress": False}
             trainers[name] = Trainer(config, directory, **parts)

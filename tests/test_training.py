@@ -23,7 +23,7 @@ from bgpo_trl.scenes.nico import NicoEnv, NicoSimulation
 from bgpo_trl.training import Trainer
 from tests.algorithms.playing import assert_same
 from tests.conftest import of_name
-from tests.helpers import DISTINCT, Recorder, at_step, contents, finish, interrupt, rows
+from tests.helpers import DISTINCT, Recorder, at_step, contents, finish, interrupt, rows, spied
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 CSV_FILES = ("train.csv", "eval.csv")
@@ -126,23 +126,14 @@ def test_rows_of_a_seed_equal_those_of_the_seed_alone(
 
 
 def test_training_draws_seen_demonstrations_and_tests_held_out_ones(
-    begin, make_config, bank, tmp_path, monkeypatch
+    begin, make_config, bank, tmp_path
 ):
     trainer = begin(tmp_path, make_config(name="without-gwr", episodes=4))
-    store, test = trainer.algorithm.store, trainer.evaluator.run
-    trained_on, tested_on = [], []
-
-    def recorded_store(transition):
-        trained_on.append(transition["behavior"])
-        store(transition)
-
-    def recorded_test(snapshots, *args):
-        tested_on.extend(4 * snapshot.policy.context.flatten(0, 1) for snapshot in snapshots)
-        return test(snapshots, *args)
-
-    monkeypatch.setattr(trainer.algorithm, "store", recorded_store)
-    monkeypatch.setattr(trainer.evaluator, "run", recorded_test)
+    stored, tested = spied(trainer.algorithm, "store"), spied(trainer.evaluator, "run")
     trainer.run()
+    trained_on = [transition["behavior"] for (transition,), _ in stored]
+    contexts = [one.policy.context for (snapshots, *_), _ in tested for one in snapshots]
+    tested_on = [4 * context.flatten(0, 1) for context in contexts]
     for given, allowed in ((trained_on, bank.seen()), (tested_on, bank.held_out("validation"))):
         shown = torch.cat(given).unique(dim=0)
         assert len(shown) > 3
@@ -188,9 +179,7 @@ def test_an_algorithm_may_log_further_losses(uninterrupted, begin, tmp_path):
 
 
 def test_an_update_follows_every_so_many_steps(begin, make_config, tmp_path):
-    config = make_config("state", "ddpg", episodes=4)
-    rl = replace(config.algorithm.rl, update_every=3)
-    config = replace(config, algorithm=replace(config.algorithm, rl=rl))
+    config = make_config("state", "ddpg", rl={"update_every": 3}, episodes=4)
     calls = []
 
     class Counted(BGPO):
@@ -451,10 +440,9 @@ def test_only_algorithms_that_are_given_boundaries_depend_on_them(
         assert_same_run(tmp_path, run_of(name))
 
 
-def test_a_bank_of_other_encoders_is_refused(make_config, encoders, bank, tmp_path):
-    foreign = replace(bank, encoder_id="of others")
+def test_a_bank_of_other_encoders_is_refused(begin, bank, tmp_path):
     with pytest.raises(ValueError, match="of others"):
-        Trainer(make_config(), tmp_path / "run", bank=foreign, encoders=encoders)
+        begin(tmp_path / "run", bank=replace(bank, encoder_id="of others"))
     assert not (tmp_path / "run").exists()
 
 

@@ -22,6 +22,7 @@ from tests.algorithms.playing import (
     spy_batches,
     weights_of,
 )
+from tests.helpers import spied
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 SEEDS = (4, 6)
@@ -149,17 +150,11 @@ def test_students_learn_from_their_teachers_at_the_end_of_each_episode(make, sch
 
 def test_students_learn_what_their_teachers_do_in_tests(make, monkeypatch):
     """The clone of one task, and what the critics choose in the others."""
-    algorithm, taught = make("dist-nll-demonstrations", state="latent"), []
+    algorithm = make("dist-nll-demonstrations", state="latent")
     play(algorithm, 60)
     algorithm.proposals.clone_is_better = lambda seed, task: task == 0
     algorithm.learner.policy.caution = 0.0  # of critics that have learned little, few agree
-    learn = dist_nll.distillation_loss
-
-    def spy(student, part):
-        taught.append(part.clone())
-        return learn(student, part)
-
-    monkeypatch.setattr(dist_nll, "distillation_loss", spy)
+    taught = spied(dist_nll, "distillation_loss", monkeypatch)
     algorithm._distill(1)
     loss, chosen = algorithm.learner.loss, set()
     assert len(algorithm._head_tasks[1]) == N_TASKS
@@ -169,7 +164,7 @@ def test_students_learn_what_their_teachers_do_in_tests(make, monkeypatch):
             for parameters in (loss.actor_network_params, loss.clone_network_params)
         )
         critics = [weights_of(loss.target_value_network_params, 1, task, n) for n in range(5)]
-        for part in taught:
+        for (_, part), _ in taught:
             for state, told in zip(part["latent"][row], part["teacher_action"][row], strict=True):
                 action = choice(actor, clone, critics, state, only_clone=task == 0, caution=0)
                 torch.testing.assert_close(told, action, rtol=1e-4, atol=1e-5)

@@ -5,21 +5,10 @@ import torch
 
 from bgpo_trl.transforms import TaskSchedule
 from tests.algorithms.playing import play, snapshot, spy_batches
+from tests.helpers import spied
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 N_TASKS = 3
-
-
-def spy_adaptations(algorithm):
-    """The data that policies adapt to, and the adapted weights."""
-    adaptations, adapt = [], algorithm.loss.adapt
-
-    def spy(data):
-        adaptations.append((data, adapt(data)))
-        return adaptations[-1][1]
-
-    algorithm.loss.adapt = spy
-    return adaptations
 
 
 def test_tests_adapt_to_drawn_transitions_of_a_task_that_has_enough(make_task_algorithm):
@@ -27,10 +16,10 @@ def test_tests_adapt_to_drawn_transitions_of_a_task_that_has_enough(make_task_al
     algorithm = make_task_algorithm("maml", schedule=TaskSchedule((0, 2, 99)), **options)
     assert algorithm.loss.inner_learning_rate == 0.5
     data, _ = play(algorithm, 40)
-    adaptations = spy_adaptations(algorithm)
+    adaptations = spied(algorithm.loss, "adapt")
     for index in range(2):
         frozen = snapshot(algorithm, index, seed=5).parameters
-        drawn, adapted = adaptations[-1]
+        (drawn,), adapted = adaptations[-1]
         draw = torch.randint(2**63 - 1, (), generator=torch.Generator().manual_seed(5))
         stream = torch.Generator().manual_seed(int(draw))
         shares = torch.rand(2 * 20, generator=stream, dtype=torch.float64).view(2, 20)
@@ -48,10 +37,10 @@ def test_tests_adapt_to_drawn_transitions_of_a_task_that_has_enough(make_task_al
 def test_tests_adapt_to_the_latest_transitions_of_a_task(make_task_algorithm):
     algorithm = make_task_algorithm("maml", adaptation_size=9, adapt_to_latest=True)
     data, _ = play(algorithm, 40)
-    adaptations = spy_adaptations(algorithm)
+    adaptations = spied(algorithm.loss, "adapt")
     first, second = (snapshot(algorithm, 1, seed=seed).parameters for seed in (5, 6))
     assert all(value.equal(second[key]) for key, value in first.items())
-    adapted_to, _ = adaptations[0]
+    (adapted_to,), _ = adaptations[0]
     for index in range(2):
         for task in range(N_TASKS):
             seen = data["state"][index][data["task"][index] == task][-9:]

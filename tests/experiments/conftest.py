@@ -110,7 +110,6 @@ def scripted_run(make_config):
     def make(name, task, act):
         nico.add_task(name, task)
         config = make_config("state", "oracle", tasks=(name,), task_starts=(0,))
-        config = replace(config, algorithm=replace(config.algorithm, max_steps=6))
         none_seen = torch.zeros(4, dtype=torch.bool)
         held_out = DemonstrationBank(torch.zeros(4, 32), torch.zeros(4).long(), none_seen, (name,))
         return LoadedRun(config, Scripted(act), None, held_out, [0])

@@ -98,9 +98,7 @@ def test_sizes_that_are_not_the_checkpoints_take_no_memory(
     run, begin, make_config, refused, name, size
 ):
     """For settings are compared with those in the checkpoint before anything is made."""
-    config = make_config()
-    rl = replace(config.algorithm.rl, **{name: size})
-    config = replace(config, algorithm=replace(config.algorithm, rl=rl))
+    config = make_config(rl={name: size})
     edit(run / "config.json", algorithm=asdict(config.algorithm))
     resume = partial(begin, run, config, resume=True)
     cause = f"checkpoint holds a run with other settings (algorithm.rl.{name} is"

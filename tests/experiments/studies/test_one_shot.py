@@ -13,7 +13,7 @@ from bgpo_trl import load_run
 from bgpo_trl.analysis.task_inference import majority_task, match_counts
 from bgpo_trl.data.recording import record_demonstrations
 from suites import nico
-from tests.helpers import cells, rows
+from tests.helpers import cells, rows, spied
 
 TASKS = nico.PAPER_TASKS
 
@@ -53,23 +53,16 @@ def test_cells_of_gwr_are_empty_without_it(run_of, tmp_path):
 
 def test_policies_are_shown_the_beginning_of_new_demonstrations(run_of, tmp_path, monkeypatch):
     policy = load_run(run_of("bgpo"))
-    shown_to = []
-    snapshot = policy.algorithm.snapshot
-
-    def spy(index, embedding, task, generator):
-        shown_to.append((index, embedding, task))
-        return snapshot(index, embedding, task, generator)
-
-    monkeypatch.setattr(policy.algorithm, "snapshot", spy)
+    copied = spied(policy.algorithm, "snapshot", monkeypatch)
     table = one_shot.measure(policy, (0.3, 1.0), 2, 4).set_index(["share", "seed", "task"])
     shown = record_demonstrations(
         tmp_path / "again", per_task=2, held_out_per_task=0, seed=4, progress=False
     )
     monkeypatch.undo()
-    assert [index for index, _, _ in shown_to] == [0, 1, 0, 1]
+    assert [index for (index, *_), _ in copied] == [0, 1, 0, 1]
     gwr = policy.algorithm.gwr
     task_of_node = majority_task(match_counts(gwr, policy.bank.seen()))
-    for share, (_, embedding, task) in zip((0.3, 1.0), shown_to[::2], strict=True):
+    for share, ((_, embedding, task, _), _) in zip((0.3, 1.0), copied[::2], strict=True):
         assert task.tolist() == [[0, 0], [1, 1], [2, 2]]
         for row in range(6):
             n_frames = round(share * int(shown["length"][row]))
