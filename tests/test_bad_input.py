@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
 from torchrl.envs import Compose, StepCounter, TransformedEnv
 
 from bgpo_trl.data.recording import record_demonstrations
@@ -77,8 +78,12 @@ def actor(**options):
     return Actor(6, 4, in_keys=["state"], **options)
 
 
+def critic(*stack):
+    return Critic(6, 4, in_keys=["state"], batch_size=stack)
+
+
 def loss(**options):
-    return DDPGLoss(actor(), Critic(6, 4, in_keys=["state"]), **options)
+    return DDPGLoss(actor(), critic(), **options)
 
 
 def windows(*shape, action=4):
@@ -91,6 +96,11 @@ lae, lengths = SequenceAutoencoder(), torch.tensor([5, 5])
 WRONG = {
     # GWR-B
     "gwr of no features": (lambda: GWRB(0), "n_features"),
+    "gwr of another start": (lambda: GWRB(4, init="zeros"), "init must be"),
+    "gwr of one node": (lambda: GWRB(4, max_nodes=1), "max_nodes must be"),
+    "gwr of no network": (lambda: GWRB(4, batch_size=[0]), "batch_size must be"),
+    "gwr of few streams": (
+        lambda: GWRB(4, batch_size=[3], generator=[torch.Generator()]), "generator must be"),
     "gwr empty": (lambda: GWRB(2, init="data").lookup(torch.zeros(2)), "empty"),
     "gwr part of a node": (lambda: GWRB(2, max_nodes=2.5), "got 2.5"),
     # networks
@@ -124,6 +134,20 @@ WRONG = {
     "ddpg without next state": (
         lambda: loss()(transitions(("next", "state"))), "under 'next', found no 'state'"),
     "ddpg flat reward": (lambda: loss()(transitions(reward=(8,))), "got [8]"),
+    # A container hides the batch size, and with it the seeds whose losses are summed.
+    "ddpg in a container": (
+        lambda: DDPGLoss(TensorDictSequential(actor(batch_size=[3])), critic(3)), "batch_size"),
+    "critics of other seeds": (
+        lambda: DDPGLoss(actor(batch_size=[3]), critic(2)), "value_network must have"),
+    "clone of no seed": (
+        lambda: DDPGLoss(actor(batch_size=[3]), critic(3), actor()), "clone_network must have"),
+    "no range of returns": (lambda: loss(return_bounds=(1.0, 1.0)), "return_bounds"),
+    "NaN penalty": (lambda: loss(pre_tanh_penalty=NAN), "pre_tanh_penalty"),
+    "constants by another name": (lambda: loss(constant_keys=["lable"]), "constant_keys"),
+    # Targets would be wrong where an episode ends within n steps.
+    "transitions of MultiStep": (
+        lambda: loss()(transitions().set("nonterminal", torch.ones(8, 1).bool())),
+        "GroupReplay(n_steps="),
     "targets that never move": (lambda: ForeachSoftUpdate(loss(), tau=0.0), "got 0.0"),
     "distillation without teacher": (
         lambda: distillation_loss(actor(), transitions()), "no 'teacher_action'"),

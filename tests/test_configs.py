@@ -11,6 +11,7 @@ from bgpo_trl.configs import (
     AlgorithmConfig,
     BGPOConfig,
     DistNLLConfig,
+    FineTuningConfig,
     GWRBConfig,
     MAMLConfig,
     RepresentationConfig,
@@ -64,6 +65,7 @@ BAD = {
         "beta": NAN,
         "demonstration_share": 0.999,
     },
+    FineTuningConfig: {"group_balanced_replay": True},  # of which nothing is forgotten
     MAMLConfig: {"inner_learning_rate": NAN, "task_batch_size": 7, "demonstration_share": 0.999},
     DistNLLConfig: {
         "learning_rate": NAN,
@@ -83,6 +85,7 @@ BAD = {
 }
 CASES = [(config, *value) for config, values in BAD.items() for value in values.items()]
 CASES += [(RunConfig, "task_starts", starts) for starts in ((), (0, -1, 300), (0, 0.5, 1), (0, 1))]
+CASES.append((VAEConfig, "window", 1))
 OF_ANOTHER_TYPE = {"episodes": True, "seeds": 3, "tasks": "grasp", "spread": "1", "algorithm": 5}
 CASES += [(RunConfig, *value) for value in OF_ANOTHER_TYPE.items()]
 

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from bgpo_trl.algorithms import entry
-from bgpo_trl.configs import FineTuningConfig
 from bgpo_trl.transforms import TaskSchedule
 from tests.algorithms.playing import assert_same, weights
 from tests.algorithms.playing import play as play_one_task
@@ -104,9 +103,3 @@ def test_ewc_consolidates_once_where_several_tasks_begin_at_once(make):
     for algorithm, tasks in ((once, [(0, 1)]), (twice, [(0, 1), (0, 2)])):
         play(algorithm, 20, boundaries={19: tasks})
     assert_same(once.learner.state_dict(), twice.learner.state_dict())
-
-
-@pytest.mark.parametrize("setting", [{"experts": True}, {"group_balanced_replay": True}])
-def test_stores_that_are_not_emptied_are_refused(setting):
-    with pytest.raises(ValueError):
-        FineTuningConfig(**setting)

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModule
 from torchrl import objectives
 from torchrl.objectives.value import TD0Estimator
 
@@ -101,14 +101,6 @@ def test_targets_and_value_loss_by_hand(name, target_values, bounds):
     torch.testing.assert_close(result["loss_value"], squares.sum(0).mean())
     torch.testing.assert_close(batch["td_error"], squares.amax(0))
     torch.testing.assert_close(result["td_error_max"], squares.max())
-
-
-def test_transitions_of_multi_step_are_refused():
-    """TorchRL's transform, whose targets would be wrong where an episode ends within n steps."""
-    batch = make_batch(4)
-    batch["nonterminal"] = torch.ones(4, 1, dtype=torch.bool)
-    with pytest.raises(ValueError, match=r"MultiStep leaves .* GroupReplay\(n_steps=...\)"):
-        make_loss("ddpg")(batch)
 
 
 def test_all_pairs_of_critics_take_turns():
@@ -303,27 +295,6 @@ def test_targets_follow_by_a_share_also_after_a_cast(name):
         update.step()
     for target, old in zip(targets_of(loss), before, strict=True):
         torch.testing.assert_close(target, old + 1 - 0.9**3)
-
-
-def test_bad_arguments_are_refused():
-    policy = Actor(3, 2, in_keys=["state"], batch_size=(3,))
-    critics = Critic(3, 2, in_keys=["state"], batch_size=(3,))
-    # A container hides the batch size, and with it the seeds whose losses are summed.
-    for actor_network, value_network in (
-        (TensorDictSequential(policy), critics),
-        (policy, Critic(3, 2, in_keys=["state"], batch_size=(2,))),
-    ):
-        with pytest.raises(ValueError, match="batch_size"):
-            DDPGLoss(actor_network, value_network)
-    with pytest.raises(ValueError, match="clone_network"):
-        DDPGLoss(policy, critics, Actor(3, 2, in_keys=["state"]))
-    for option, value in (
-        ("return_bounds", (1.0, 1.0)),
-        ("pre_tanh_penalty", math.nan),
-        ("constant_keys", ["lable"]),
-    ):
-        with pytest.raises(ValueError, match=option):
-            DDPGLoss(policy, critics, **{option: value})
 
 
 def test_weights_are_factors_of_each_transitions_losses():

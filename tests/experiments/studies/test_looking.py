@@ -14,7 +14,6 @@ from shared import TrainedArguments, load_blocks
 from tensordict import TensorDict
 
 from bgpo_trl.runs.results import read_table
-from bgpo_trl.scenes.nico import NicoEnv
 from suites import nico
 from suites.nico.rendering import FrameRenderer
 from tests.helpers import cells
@@ -121,26 +120,6 @@ def test_observations_show_objects_at_nominal_places(hidden):
     env.reset(TensorDict({"_reset": torch.tensor([[False], [True]])}, [2]))
     check(env, 1, nominal)
     env.close()
-
-
-def test_the_simulation_is_that_of_the_plain_environment():
-    views = ({"hidden": "places"}, {"hidden": "objects"})
-    envs = [
-        NicoEnv(batch_size=[2], seed=4),
-        *(HidingEnv(batch_size=[2], seed=4, **v) for v in views),
-    ]
-    states = [env.reset(TensorDict({"task": torch.tensor([0, 2])}, [2])) for env in envs]
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(5):
-        action = torch.rand(2, 4, generator=generator) * 2 - 1
-        for env, state in zip(envs, states, strict=True):
-            env.step(state.set("action", action))
-        true, *others = (env.simulation_state()["simulations"] for env in envs)
-        for hiding in others:
-            for plain, other in zip(true, hiding, strict=True):
-                assert plain["physics"].equal(other["physics"])
-    for env in envs:
-        env.close()
 
 
 def test_the_table_equals_that_by_hand():
