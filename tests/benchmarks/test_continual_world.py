@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 
-from bgpo_trl.configs import RepresentationConfig, SequenceAutoencoderConfig, VAEConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.representation import load_representation
 from bgpo_trl.scenes import SCENES, find_scene
+from tests.helpers import TINY_ENCODERS
 
 pytest.importorskip("metaworld", reason="Meta-World is not installed (docs/extending.md)")
 
@@ -15,11 +15,7 @@ import examples.continual_world  # noqa: F401 - adds the scene
 from benchmarks import continual_world
 
 pytestmark = pytest.mark.slow
-TINY = RepresentationConfig(
-    vae=VAEConfig(steps=2, batch_size=16),
-    lae=SequenceAutoencoderConfig(steps=2, batch_size=4),
-    inverse=continual_world.WITHOUT_INVERSE,
-)
+TINY = replace(TINY_ENCODERS, inverse=continual_world.WITHOUT_INVERSE)
 
 
 @pytest.mark.filterwarnings("ignore:encoders:UserWarning")

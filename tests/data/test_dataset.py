@@ -118,32 +118,27 @@ def test_episodes_without_movement_and_such_as_are_given_twice_are_named(tmp_pat
     ]
 
 
-def test_frames_of_fractions_that_were_cut_off_are_named(tmp_path):
-    frames = episode_of(4, keys=("pixels",))["pixels"]
-    episode = {"pixels": (frames / frames.max()).astype(np.uint8)}
-    with pytest.warns(UserWarning, match="1 of 1 episodes, .* have no color above 1"):
-        write(tmp_path / "own", {TASKS[0]: [episode]}, held_out_per_task=0)
+FRAMES = episode_of(52)["pixels"]
 
 
 @pytest.mark.parametrize(
-    ("length", "order", "doubt"),
+    ("frames", "doubt"),
     [
-        (52, range(52), "have more steps than the scene's 50: at another rate, or not cut?"),
-        (9, [0] * 6 + [1, 2, 3], "begin with 5 or more steps that change nothing: cut them off"),
-        (9, [0, 1, 2] + [3] * 6, "end with 5 or more steps that change nothing: cut them off"),
-        (9, [0, 0, 2, 2, 4, 4, 6, 6, 8], "repeat every other frame: is the camera slower"),
-        (51, range(51), None),
-        (9, [0] * 5 + [1, 1, 1, 1], None),
+        (FRAMES, "have more steps than the scene's 50: at another rate, or not cut?"),
+        (FRAMES[[0] * 6 + [1, 2, 3]], "begin with 5 or more steps that change nothing: cut them"),
+        (FRAMES[[0, 1, 2] + [3] * 6], "end with 5 or more steps that change nothing: cut them off"),
+        (FRAMES[[0, 0, 2, 2, 4, 4, 6, 6, 8]], "repeat every other frame: is the camera slower"),
+        ((FRAMES[:9] / 255).astype(np.uint8), "have no color above 1: are they fractions"),
+        (FRAMES[:51], None),
+        (FRAMES[[0] * 5 + [1, 1, 1, 1]], None),
     ],
 )
-def test_episodes_that_are_not_cut_or_at_another_rate_are_named(tmp_path, length, order, doubt):
+def test_episodes_that_are_not_cut_or_at_another_rate_or_of_fractions_are_named(
+    tmp_path, frames, doubt
+):
     """Four steps without change may be part of a task."""
-    frames = episode_of(length, keys=("pixels",))["pixels"]
     with warnings.catch_warnings(record=True) as caught:
-        write(
-            tmp_path / "own",
-            {TASKS[0]: [{"pixels": frames[[*order]]}, episode_of(4, keys=("pixels",))]},
-        )
+        write(tmp_path / "own", {TASKS[0]: [{"pixels": frames}, episode_of(4, keys=("pixels",))]})
     assert [doubt in str(one.message) for one in caught] == ([] if doubt is None else [True])
 
 

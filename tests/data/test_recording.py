@@ -10,7 +10,7 @@ from bgpo_trl.experiments.arguments import RecordArguments
 from bgpo_trl.experiments.make_data import record
 from suites import nico
 from tests.helpers import contents
-from tests.scenes.dot import demonstrate, scene
+from tests.scenes.dot import demonstrate, record_some, scene
 
 TINY = {"per_task": 3, "held_out_per_task": 1, "progress": False}
 KEYS = {"pixels", "state", "joints", "action", "length", "task", "train", "seed"}
@@ -111,9 +111,8 @@ def test_a_demonstrator_that_seldom_succeeds_is_told_of(tmp_path):
         act = demonstrate(simulation, task, seed)
         return act if seed % 8 == 0 or task == "right" else lambda: 0 * act()
 
-    options = {"per_task": 6, "held_out_per_task": 1, "progress": False}
     with pytest.warns(UserWarning) as warned:
-        record_demonstrations(tmp_path, scene=scene(demonstrator=seldom), **options)
+        record_some(tmp_path, scene(demonstrator=seldom), per_task=6)
     (told,) = [str(line.message) for line in warned]
     assert re.match(r"the demonstrator of 'left' succeeded in 6 of \d\d attempts: ", told)
 

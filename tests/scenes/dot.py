@@ -7,6 +7,7 @@ import numpy as np
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import RunConfig
+from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.scenes import Outcome, Scene, Simulation, SimulationEnv
 from bgpo_trl.seeding import random_state, set_random_state
@@ -67,6 +68,12 @@ def scene(make=Dot, *, env=SimulationEnv, **changes):
         "demonstrator": demonstrate,
     }
     return Scene(name="dot", version="dot-1", **{**SHAPE, **options, **changes})
+
+
+def record_some(path, robot, **options):
+    """Return two new demonstrations of each task of a scene, one of them held out."""
+    options = {"per_task": 2, "held_out_per_task": 1, "progress": False, **options}
+    return record_demonstrations(path, scene=robot, **options)
 
 
 def pretrain(robot, folder, per_task=6):

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.scenes import Outcome, RobotEnv, StateColumns, find_scene
 from bgpo_trl.scenes.check import check_scene
 from bgpo_trl.seeding import random_state
-from tests.scenes.dot import Dot, SavedDot, scene
+from tests.scenes.dot import Dot, SavedDot, record_some, scene
 
 
 class Late(Dot):
@@ -132,9 +131,7 @@ def test_doubts(make, doubts, tmp_path):
     assert all(doubt in line for doubt, line in zip(doubts, found, strict=True))
     if doubts and make is not Deaf:  # whose demonstrator does not succeed
         with pytest.warns(UserWarning) as warned:
-            record_demonstrations(
-                tmp_path, scene=scene(make), per_task=2, held_out_per_task=1, progress=False
-            )
+            record_some(tmp_path, scene(make))
         assert [str(line.message) for line in warned] == [f"the scene 'dot': {x}" for x in found]
 
 
@@ -148,7 +145,7 @@ def test_doubts(make, doubts, tmp_path):
 )
 def test_what_is_wrong_is_not_recorded(make, reason, tmp_path):
     with pytest.raises(ValueError, match=reason):
-        record_demonstrations(tmp_path, scene=scene(make), progress=False)
+        record_some(tmp_path, scene(make))
     assert not [*tmp_path.iterdir()]
 
 

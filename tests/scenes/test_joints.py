@@ -19,7 +19,7 @@ from bgpo_trl.encoders.train import make_bank, train_encoders
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.policy import load_run
 from bgpo_trl.scenes import SCENES, StateColumns
-from tests.helpers import TINY_ENCODERS
+from tests.helpers import TINY_ENCODERS, finish
 from tests.scenes.dot import TASKS, SavedDot, run_config, scene, trainer_of
 
 CENTER, SCALE = (0.5, 10.0), (2.0, 4.0)
@@ -60,10 +60,7 @@ JOINED = {"joints": True, "rl": SMALL, "expert_batch_size": 8, "demonstration_no
 
 def run(made, folder, name="bgpo", algorithm=JOINED):
     """Return the trainer of a run, after it."""
-    config = run_config(name, algorithm, task_starts=(0, 0))
-    with trainer_of(folder, made[1:], config) as trainer:
-        trainer.run()
-    return trainer
+    return finish(trainer_of(folder, made[1:], run_config(name, algorithm, task_starts=(0, 0))))
 
 
 def scaled(readings):

@@ -8,11 +8,19 @@ import torch
 from torchrl.envs import check_env_specs
 
 from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
-from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.policy import load_run
 from bgpo_trl.runs.results import read_table
 from bgpo_trl.scenes import SCENES, Outcome, RobotEnv, SimulationEnv
-from tests.scenes.dot import SHAPE, TASKS, SavedDot, pretrain, run_config, scene, trainer_of
+from tests.helpers import finish
+from tests.scenes.dot import (
+    SHAPE,
+    TASKS,
+    SavedDot,
+    pretrain,
+    record_some,
+    run_config,
+    scene,
+    trainer_of,
+)
 
 LIMIT = np.float32(0.2)
 
@@ -60,10 +68,8 @@ def test_executed_actions_are_not_lost_in_an_environment_of_simulations():
 
 
 def test_recordings_hold_the_executed_actions(tmp_path):
-    recorded = record_demonstrations(
-        tmp_path / "shown", scene=robot_scene(), per_task=2, held_out_per_task=1, progress=False
-    )  # the demonstrator asks for .3
-    actions = recorded["action"][torch.arange(12) < recorded["length"][:, None] - 1]
+    shown = record_some(tmp_path, robot_scene())  # whose demonstrator asks for .3
+    actions = shown["action"][torch.arange(12) < shown["length"][:, None] - 1]
     assert float(actions.abs().max()) == LIMIT
 
 
@@ -87,12 +93,7 @@ def test_a_run_without_tests_learns_from_what_was_executed(tmp_path, monkeypatch
     torch.testing.assert_close(held["action"], expected)
     assert not len(read_table(tmp_path / "run" / "eval.csv"))
     longer = replace(config, episodes=6)  # the dot, unlike most robots, can be saved
-    with trainer_of(tmp_path / "run", pretrained, longer, resume=True) as trainer:
-        trainer.run()
-    frame = stepped(robot.simulate(TASKS), 0.0)["pixels"].numpy()
-    policy = load_run(tmp_path / "run")
-    policy.condition(frame[None])
-    assert abs(float(policy.act(frame)[0])) <= 1
+    finish(trainer_of(tmp_path / "run", pretrained, longer, resume=True))
 
 
 def test_several_robots_are_refused_in_one_line(refused):

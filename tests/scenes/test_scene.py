@@ -22,7 +22,7 @@ from bgpo_trl.modules.vae import VAE
 from bgpo_trl.policy import load_run
 from bgpo_trl.runs.results import read_table
 from bgpo_trl.scenes import SCENES, Outcome, SimulationEnv, StateColumns, find_scene
-from tests.helpers import TINY_ENCODERS
+from tests.helpers import TINY_ENCODERS, finish
 from tests.scenes.dot import (
     SHAPE,
     TASKS,
@@ -30,6 +30,7 @@ from tests.scenes.dot import (
     SavedDot,
     demonstrate,
     pretrain,
+    record_some,
     run_config,
     scene,
     trainer_of,
@@ -44,11 +45,6 @@ def pretrained(tmp_path_factory):
 @pytest.fixture
 def dot(monkeypatch):
     monkeypatch.setitem(SCENES, "dot", scene())
-
-
-def train(directory, pretrained, config=None, **options):
-    with trainer_of(directory, pretrained, config, **options) as trainer:
-        trainer.run()
 
 
 def test_an_environment_of_a_simulation_keeps_the_promises_to_torchrl():
@@ -83,7 +79,7 @@ def test_a_failed_episode_is_no_success(tmp_path):
     rate = evaluate_random_policy(tasks=TASKS, episodes=4, max_steps=12, scene=falling)
     assert rate.tolist() == [0.0, 0.0]
     with pytest.raises(RuntimeError, match="the demonstrator of 'left' failed 2 times in a row"):
-        recorded(tmp_path, falling, attempts=2)
+        record_some(tmp_path, falling, attempts=2)
 
 
 def test_what_a_scene_lacks_is_refused_in_a_line(tmp_path):
@@ -106,7 +102,7 @@ def test_what_a_scene_lacks_is_refused_in_a_line(tmp_path):
 
 
 def test_demonstrations_have_the_shapes_of_the_scene(tmp_path):
-    data = recorded(tmp_path, seen())
+    data = record_some(tmp_path, seen())
     assert data["pixels"].shape == (4, 13, 16, 24, 3)
     assert data["action"].shape == (4, 12, 1)
     assert data["state"].shape == (4, 13, 1)
@@ -233,60 +229,50 @@ def thrifty(robot, task, seed):
 
 def test_arrays_may_be_used_again(tmp_path):
     """A recording keeps what a simulation and a demonstrator changed later."""
-    options = {"per_task": np.int64(2), "held_out_per_task": 1, "progress": False}
-    plain = record_demonstrations(tmp_path / "plain", scene=scene(), **options)
-    robot = scene(Thrifty, demonstrator=thrifty)
-    found = record_demonstrations(tmp_path / "thrifty", scene=robot, **options)
+    plain = record_some(tmp_path / "plain", scene(), per_task=np.int64(2))
+    found = record_some(tmp_path / "thrifty", scene(Thrifty, demonstrator=thrifty))
     for key, values in plain.items():
         assert found[key].equal(values), key
 
 
 class Walker(Dot):
-    """A dot that is slow, with a second action that does nothing, in square frames."""
-
-    size = 16
+    """A dot that is slow, with a second action that does nothing, in large square frames."""
 
     def step(self, action):
         return super().step(0.05 * action)
 
     def frame(self):
-        frame = np.zeros((self.size, self.size, 3), np.uint8)
+        frame = np.zeros((48, 48, 3), np.uint8)
         frame[6:10, round(5 + 5 * self.place) :][:, :4] = 255
         return frame
 
 
-class LargeWalker(Walker):
-    size = 48
-
-
-@pytest.mark.parametrize(("make", "n_actions", "n_steps"), [(Walker, 1, 7), (LargeWalker, 2, 60)])
-def test_frames_actions_and_episodes_have_any_size(make, n_actions, n_steps, tmp_path, monkeypatch):
-    shape = {"frame_shape": (make.size, make.size), "action_size": n_actions}
+def test_frames_actions_and_episodes_have_any_size(tmp_path):
     rng = np.random.default_rng(0)
     shown = {
         task: [
             {
-                "pixels": rng.integers(0, 256, (length, make.size, make.size, 3), dtype=np.uint8),
-                "action": np.zeros((length - 1, n_actions)),
+                "pixels": rng.integers(0, 256, (length, 48, 48, 3), dtype=np.uint8),
+                "action": np.zeros((length - 1, 2)),
             }
-            for length in range(n_steps - 3, n_steps)
+            for length in (57, 58, 59)
         ]
         for task in TASKS
     }
-    walker = scene(make, max_steps=n_steps, **shape)
-    monkeypatch.setitem(SCENES, "dot", walker)
+    walker = scene(Walker, max_steps=60, frame_shape=(48, 48), action_size=2)
+    SCENES["dot"] = walker
     dataset = write_demonstrations(tmp_path / "own", shown, scene=walker, held_out_per_task=1)
     paths = tmp_path / "encoders.safetensors", tmp_path / "log"
     options = {"tasks": TASKS, "scene": walker, "progress": False}
     pretrained = train_encoders(dataset, None, *paths, TINY_ENCODERS, **options)
-    config = run_config(algorithm={"max_steps": n_steps}, episodes=2)
-    train(tmp_path / "run", pretrained, config)
+    config = run_config(algorithm={"max_steps": 60}, episodes=2)
+    finish(trainer_of(tmp_path / "run", pretrained, config))
     steps = read_table(tmp_path / "run" / "train.csv")["steps"].astype(int)
-    assert steps.max() == n_steps
+    assert steps.max() == 60
     policy = load_run(tmp_path / "run")
     frames = shown["left"][0]["pixels"]
     policy.condition(frames)
-    assert policy.act(frames[0]).shape == (n_actions,)
+    assert policy.act(frames[0]).shape == (2,)
 
 
 RETURNED = [
@@ -319,18 +305,12 @@ def seen(make=Seen):
     return scene(make, state=StateColumns(center=(0.0,), scale=(1.0,)))
 
 
-def recorded(path, robot, **options):
-    return record_demonstrations(
-        path, scene=robot, per_task=2, held_out_per_task=1, progress=False, **options
-    )
-
-
 @pytest.mark.parametrize(("method", "value", "message"), RETURNED)
 def test_what_a_simulation_returns_is_checked(tmp_path, method, value, message):
     odd = seen(type("Odd", (Seen,), {method: lambda *_: value}))
     for call in (
         lambda: odd.simulate(TASKS, observation="both").rollout(2),
-        lambda: recorded(tmp_path, odd),
+        lambda: record_some(tmp_path, odd),
     ):
         with pytest.raises(ValueError, match=rf"Odd\.{method}\(\) returned {message}"):
             call()
@@ -357,7 +337,7 @@ def test_a_ground_truth_is_divided_by_numbers_above_zero(column):
 def test_actions_of_a_demonstrator_are_checked_as_those_of_a_dataset(tmp_path, action, message):
     bold = scene(demonstrator=lambda robot, task, seed: lambda: np.array(action))
     with pytest.raises(ValueError, match=f"an episode of the demonstrator of 'right' {message}"):
-        recorded(tmp_path, bold, tasks=["right"])
+        record_some(tmp_path, bold, tasks=["right"])
 
 
 def test_a_run_whose_encoders_could_not_be_loaded_again_does_not_begin(pretrained, dot, tmp_path):
@@ -415,7 +395,7 @@ def test_a_ground_truth_that_the_simulation_does_not_have_is_named():
 
 
 def test_a_run_whose_simulation_cannot_be_saved_is_not_resumed(pretrained, dot, tmp_path):
-    train(tmp_path, pretrained, run_config(episodes=2))
+    finish(trainer_of(tmp_path, pretrained, run_config(episodes=2)))
     before = (tmp_path / "train.csv").read_bytes()
     with pytest.raises(ValueError, match="'dot' cannot be saved, so this run cannot be resumed"):
         trainer_of(tmp_path, pretrained, resume=True)
