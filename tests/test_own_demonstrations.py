@@ -43,8 +43,10 @@ def test_demonstrations_without_actions_train_encoders_and_runs(make_config, tmp
     assert bank.tasks == TASKS and len(bank.seen().embedding) == 6
 
     changes = {"scene": "dot", "tasks": TASKS, "task_starts": (0, 2), "episodes": 4, "seeds": (3,)}
-    unshown = {"algorithm": {"demonstration_share": 0.0}}
-    unshown["rl"] = {"proposals": "actor", "imitation": 0.0}
+    unshown = {
+        "algorithm": {"demonstration_share": 0.0},
+        "rl": {"proposals": "actor", "imitation": 0.0},
+    }
     config, run = make_config(**changes, **unshown), tmp_path / "run"
     finish(Trainer(config, run, bank=bank, encoders=encoders, progress=False))
 

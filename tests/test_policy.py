@@ -285,6 +285,8 @@ def test_arrays_that_are_no_demonstration_or_no_frame_are_refused(load):
     for wrong in (frame[None], frame / 255, frame[:, :-1], []):
         with pytest.raises(ValueError, match=r"uint8 \[32, 64, 3\]"):
             policy.act(wrong)
+    with pytest.raises(ValueError, match="reads no joints: give it frames alone"):
+        policy.act(frame, [0.0] * 4)
     np.testing.assert_array_equal(policy.act(frame), before)
 
 

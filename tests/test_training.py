@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from bgpo_trl import training
-from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.encoders.pretrained import load_pretrained
@@ -138,16 +137,6 @@ def test_training_draws_seen_demonstrations_and_tests_held_out_ones(
         shown = torch.cat(given).unique(dim=0)
         assert len(shown) > 3
         assert (shown.unsqueeze(1) == allowed.embedding).all(-1).any(1).all()
-
-
-def test_an_algorithm_may_be_made_under_another_name(begin, make_config, tmp_path):
-    config = replace(make_config("state", "ddpg", episodes=2), name="mine")
-    with pytest.raises(ValueError, match="no algorithm 'mine'"):
-        begin(tmp_path / "refused", config)
-    trainer = finish(begin(tmp_path, config, make=ALGORITHMS["ddpg"].make))
-    assert trainer.algorithm.config == config.algorithm
-    for file in CSV_FILES:
-        assert {row["algorithm"] for row in rows(tmp_path / file)} == {"mine"}
 
 
 class WithEntropy(BGPO):

@@ -43,19 +43,22 @@ def make_batch(*shape, seed=0):
     return TensorDict({**data, "imitation": shown, "next": following}, shape)
 
 
-def play(algorithm, n_steps, state=None, hidden=(), watch=lambda chosen: None):
+def play(algorithm, n_steps, state=None, hidden=(), watch=lambda chosen: None, boundaries=None):
     """Trains for some steps; the algorithm gets none of the `hidden` entries.
 
-    Returns transitions ``[S, T]`` and the tensordict in flight.
+    Tasks begin after the steps that ``boundaries`` names, each as the position of a seed and the
+    task. Returns transitions ``[S, T]`` and the tensordict in flight.
     """
     state, transitions = algorithm.world.env.reset() if state is None else state, []
-    for _ in range(n_steps):
+    for step in range(n_steps):
         state.update(algorithm.act(state.exclude(*hidden)))
         watch(state)
         algorithm.update()
         transition, state = algorithm.world.env.step_and_maybe_reset(state)
         transitions.append(transition.clone())
         algorithm.store(transition.exclude(*hidden, *(("next", key) for key in hidden)))
+        for index, task in (boundaries or {}).get(step, ()):
+            algorithm.begin_task(index, task)
     return torch.stack(transitions, dim=1), state
 
 

@@ -7,12 +7,12 @@ import torch
 
 from bgpo_trl.algorithms import entry
 from bgpo_trl.transforms import TaskSchedule
-from tests.algorithms.playing import assert_same, weights
-from tests.algorithms.playing import play as play_one_task
+from tests.algorithms.playing import assert_same, play, weights
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 SEEDS = (1, 2)
-# Before the warm-up of 8 steps has ended, in the middle of training, and two tasks at once.
+# Steps after which tasks begin: before the warm-up of 8 steps has ended, in the middle of training,
+# and two tasks at once.
 BOUNDARIES = {5: [(0, 1)], 20: [(1, 1)], 31: [(0, 2)], 33: [(1, 2), (1, 0)]}
 
 
@@ -24,17 +24,6 @@ def make(bank, encoders, make_config, in_world):
         return in_world(algorithm, seeds, TaskSchedule((0, 0, 0)))
 
     return make
-
-
-def play(algorithm, n_steps, state=None, boundaries=()):
-    """Train for some steps; tasks begin after those numbered in ``boundaries``."""
-    boundaries, transitions = dict(boundaries), []
-    for step in range(n_steps):
-        played, state = play_one_task(algorithm, 1, state)
-        transitions.append(played)
-        for index, task in boundaries.get(step, ()):
-            algorithm.begin_task(index, task)
-    return torch.cat(transitions, 1), state
 
 
 def copies(algorithm, index):

@@ -8,7 +8,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
@@ -168,17 +167,6 @@ def test_baselines_read_joints_too(made, dot, tmp_path, name):
         read = [policy.act(frame, joints) for joints in ([0.5, 11.0], [-0.5, 9.0])]
         differ.append(not np.array_equal(*read))
     assert any(differ)
-
-
-def test_policies_without_joints_are_as_before(made, dot, tmp_path):
-    trainer = run(made, tmp_path / "run", algorithm={**JOINED, "joints": False})
-    assert trainer.algorithm.in_keys == ["latent", "context"]
-    assert trainer.algorithm.shown is not None
-    policy, frame = load_run(tmp_path / "run"), np.full((16, 24, 3), 90, np.uint8)
-    policy.condition(np.stack([frame] * 4))
-    with pytest.raises(ValueError, match="reads no joints: give it frames alone"):
-        policy.act(frame, [0.5, 11.0])
-    assert not any(entry.config.observed == "latent_and_joints" for entry in ALGORITHMS.values())
 
 
 def test_what_lacks_joints_is_refused_in_a_line(made, monkeypatch, tmp_path, refused):
