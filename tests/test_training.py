@@ -19,7 +19,6 @@ from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.runs.cost import n_bytes
 from bgpo_trl.runs.results import read_table
 from bgpo_trl.scenes.nico import NicoEnv, NicoSimulation
-from bgpo_trl.training import Trainer
 from tests.algorithms.playing import assert_same
 from tests.conftest import of_name
 from tests.helpers import DISTINCT, Recorder, at_step, contents, finish, interrupt, rows, spied
@@ -405,28 +404,6 @@ def test_tasks_begin_for_each_seed_before_they_are_played(begin, make_config, tm
             assert notes[:5] == [*[("played", 1)] * 3, ("begin", 0), ("begin", 2)]
             assert {kind for kind, _ in notes[5:]} == {"played"}
             assert {task for _, task in notes[5:]} <= {0, 2}
-
-
-@pytest.mark.parametrize(
-    ("name", "needs"),
-    [
-        ("bgpo", False),
-        ("maml-demonstrations", False),
-        ("dist-nll-demonstrations", False),
-        ("fine-tuning-demonstrations", True),
-        ("ewc", True),
-    ],
-)
-def test_only_algorithms_that_are_given_boundaries_depend_on_them(
-    run_of, begin, config_of, tmp_path, monkeypatch, name, needs
-):
-    monkeypatch.setattr(Trainer, "_begin_tasks", lambda trainer, index: None)
-    trainer = finish(begin(tmp_path, config_of(name)))
-    assert trainer.algorithm.needs_boundaries == needs
-    if needs:
-        assert (tmp_path / "train.csv").read_text() != (run_of(name) / "train.csv").read_text()
-    else:
-        assert_same_run(tmp_path, run_of(name))
 
 
 def test_a_bank_of_other_encoders_is_refused(begin, bank, tmp_path):

@@ -8,6 +8,7 @@ import torch
 from bgpo_trl.algorithms import entry
 from bgpo_trl.transforms import TaskSchedule
 from tests.algorithms.playing import assert_same, play, weights
+from tests.helpers import DISTINCT
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 SEEDS = (1, 2)
@@ -41,6 +42,11 @@ def test_until_the_first_boundary_it_is_ddpg_bit_for_bit(make):
         for part in ("loss", "optimizer"):
             assert_same(state[part], ddpg.learner.state_dict()[part])
         assert_same(algorithm.replay.state_dict(), ddpg.replay.state_dict())
+
+
+def test_only_fine_tuning_and_ewc_are_reported_to_need_boundaries(make):
+    needing = {name for name in DISTINCT if make(name).needs_boundaries}
+    assert needing == {"fine-tuning-demonstrations", "ewc"}
 
 
 def test_after_a_boundary_only_what_came_since_is_learned_from(make):
