@@ -16,14 +16,11 @@ N_TASKS = 3
 both = pytest.mark.parametrize("name", ["maml", "dist-nll"])
 
 
-@pytest.fixture
-def make(make_task_algorithm):
-    return make_task_algorithm
-
-
 @both
-def test_training_episodes_are_played_by_the_network_of_their_task_with_noise(make, name):
-    algorithm, noise, tasks = make(name), generators(SEEDS, "exploration"), set()
+def test_training_episodes_are_played_by_the_network_of_their_task_with_noise(
+    make_task_algorithm, name
+):
+    algorithm, noise, tasks = make_task_algorithm(name), generators(SEEDS, "exploration"), set()
 
     def watch(chosen):
         for index, source in enumerate(noise):
@@ -43,11 +40,11 @@ def test_training_episodes_are_played_by_the_network_of_their_task_with_noise(ma
 @both
 @pytest.mark.parametrize(("warmup", "n_tasks", "expected"), [(8, 3, 10), (8, 1, 8), (15, 3, 15)])
 def test_the_first_update_comes_after_the_warm_up_when_some_task_fills_a_batch_for_sure(
-    make, name, warmup, n_tasks, expected
+    make_task_algorithm, name, warmup, n_tasks, expected
 ):
     """Three tasks can have three transitions each without four of any."""
-    ddpg = replace(make(name).config.rl, warmup_steps=warmup)
-    algorithm = make(name, schedule=TaskSchedule((0,) * n_tasks), rl=ddpg)
+    ddpg = replace(make_task_algorithm(name).config.rl, warmup_steps=warmup)
+    algorithm = make_task_algorithm(name, schedule=TaskSchedule((0,) * n_tasks), rl=ddpg)
     start = deepcopy(algorithm.learner.state_dict())
     _, state = play(algorithm, expected)  # with an update before each step
     assert_same(algorithm.learner.state_dict(), start)
@@ -56,10 +53,10 @@ def test_the_first_update_comes_after_the_warm_up_when_some_task_fills_a_batch_f
 
 
 @both
-def test_tasks_can_share_a_batch_in_equal_parts(make, name):
+def test_tasks_can_share_a_batch_in_equal_parts(make_task_algorithm, name):
     """By hand: 24 transitions are 24 of one task, 12 of each of two, 8 of each of three."""
     schedule = TaskSchedule((0, 3, 6))
-    algorithm = make(name, schedule=schedule, task_batch_size=24, share_batch=True)
+    algorithm = make_task_algorithm(name, schedule=schedule, task_batch_size=24, share_batch=True)
     batches, found = spy_batches(algorithm), set()
     data, _ = play(algorithm, 150)
     for batch in batches:
@@ -86,9 +83,9 @@ def test_tasks_can_share_a_batch_in_equal_parts(make, name):
 
 
 @both
-def test_networks_stay_as_they_were_until_there_is_data_of_their_task(make, name):
+def test_networks_stay_as_they_were_until_there_is_data_of_their_task(make_task_algorithm, name):
     """But for MAML's policies, which start from one that learns from all tasks."""
-    algorithm = make(name)
+    algorithm = make_task_algorithm(name)
     of_tasks = {k: v for k, v in algorithm.learner.loss.state_dict().items() if v.ndim > 2}
     own = [v for key, v in of_tasks.items() if name != "maml" or "value" in key]
     start = [value.clone() for value in own]
@@ -110,15 +107,15 @@ def test_networks_stay_as_they_were_until_there_is_data_of_their_task(make, name
     assert len(set(stages)) > 3
 
 
-def test_a_replay_too_small_to_fill_a_batch_is_refused(make, make_config):
+def test_a_replay_too_small_to_fill_a_batch_is_refused(make_task_algorithm, make_config):
     rl = make_config("state", "maml").algorithm.rl
     # Three tasks have a full batch of 8 among them after 3 * 7 + 1 transitions.
     small = {"task_batch_size": 8, "rl": replace(rl, replay_size=22)}
-    make("maml", **small)
+    make_task_algorithm("maml", **small)
     with pytest.raises(ValueError, match=r"replay_size must be at least 22, .* learning begins"):
-        make("maml", **{**small, "rl": replace(rl, replay_size=21)})
+        make_task_algorithm("maml", **{**small, "rl": replace(rl, replay_size=21)})
 
 
 @both
-def test_targets_are_clipped_to_the_attainable_returns(make, name):
-    assert make(name).learner.loss.return_bounds == (0.0, 1.0)
+def test_targets_are_clipped_to_the_attainable_returns(make_task_algorithm, name):
+    assert make_task_algorithm(name).learner.loss.return_bounds == (0.0, 1.0)

@@ -155,16 +155,21 @@ def test_names_of_tasks_differ_and_are_printable(with_steps):
             replace(with_steps, tasks=wrong)
 
 
-def test_a_bank_is_made_of_what_the_encoders_see(encoders):
+@pytest.fixture
+def dataset():
+    """Two demonstrations of noise to learn from, and one held out."""
     generator = torch.Generator().manual_seed(4)
-    length = torch.tensor([5, 3, 4])
-    dataset = {
+    return {
         "pixels": torch.randint(256, (3, 5, 32, 64, 3), generator=generator).to(torch.uint8),
         "action": torch.rand(3, 4, 4, generator=generator) * 2 - 1,
-        "length": length,
+        "length": torch.tensor([5, 3, 4]),
         "task": torch.tensor([0, 1, 2]),
         "train": torch.tensor([True, True, False]),
     }
+
+
+def test_a_bank_is_made_of_what_the_encoders_see(encoders, dataset):
+    length = dataset["length"]
     inferred, recorded = (
         make_bank(encoders, dataset, tasks=nico.PAPER_TASKS, actions=actions)
         for actions in ("inferred", "recorded")
@@ -185,22 +190,14 @@ def test_a_bank_is_made_of_what_the_encoders_see(encoders):
         torch.testing.assert_close(recorded.steps.actions(moves), exact, rtol=0, atol=0.005)
 
 
-@pytest.mark.filterwarnings("ignore:frames fit")
 @pytest.mark.parametrize(("chosen", "noise"), [(0.05, 0.05), (0.0, 0.0), (None, 0.2)])
-def test_a_bank_has_the_noise_that_suits_its_steps(encoders, monkeypatch, chosen, noise):
+def test_a_bank_has_the_noise_that_suits_its_steps(encoders, dataset, monkeypatch, chosen, noise):
     """Or the usual one, if nothing can be told."""
     given = []
     monkeypatch.setattr(
         "bgpo_trl.encoders.train.choose_noise", lambda bank: given.append(bank) or chosen
     )
-    shown = {
-        "pixels": torch.zeros(2, 3, 32, 64, 3, dtype=torch.uint8),
-        "action": torch.rand(2, 2, 4),
-        "length": torch.tensor([3, 3]),
-        "task": torch.tensor([0, 0]),
-        "train": torch.tensor([True, True]),
-    }
-    bank = make_bank(encoders, shown, tasks=nico.PAPER_TASKS[:1])
+    bank = make_bank(encoders, dataset, tasks=nico.PAPER_TASKS)
     assert bank.noise == noise
     assert_same(given[0].steps, bank.steps)
 
