@@ -1,7 +1,5 @@
 """Updates from demonstrations alone, before the first episode."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -22,11 +20,8 @@ def offline_config(make_config):
     """Settings of a run of two tasks, whose demonstrations form two groups, and a later one."""
 
     def make(name="bgpo", **changes):
-        config = make_config(name=name, offline_updates=N, task_starts=(0, 0, 4), **changes)
-        algorithm = config.algorithm
-        if algorithm.grouped:
-            algorithm = replace(algorithm, group_evidence=0.5)
-        return replace(config, algorithm=algorithm)
+        changes = {"algorithm": {"group_evidence": 0.5}, "offline_updates": N, **changes}
+        return make_config(name=name, task_starts=(0, 0, 4), **changes)
 
     return make
 
