@@ -83,15 +83,6 @@ def test_bgpo_never_reads_the_label(make_bgpo, variant):
         assert len(ours.numbers) > 1
 
 
-def act_in_tests(algorithm, state, embedding, task):
-    return torch.stack(
-        [
-            algorithm.snapshot(index, embedding, task, torch.Generator()).act(of_seed)
-            for index, of_seed in enumerate(state)
-        ]
-    )
-
-
 def act_by_hand(weights, x):
     """The action of a policy of test episodes, from its weights."""
     if "only_clone" not in weights:
@@ -122,7 +113,9 @@ def test_test_episodes_are_played_by_the_expert_of_their_demonstration(make_bgpo
     embedding, task = shown.embedding.view(3, 4, 32), shown.task.view(3, 4)
     state = torch.randn(2, 3, 4, 64, generator=torch.Generator().manual_seed(0))
     before = deepcopy(algorithm.state_dict())
-    actions = act_in_tests(algorithm, state, embedding, task)
+    policies = [algorithm.snapshot(seed, embedding, task, torch.Generator()) for seed in range(2)]
+    acted = zip(policies, state, strict=True)
+    actions = torch.stack([policy.act(of_seed) for policy, of_seed in acted])
     assert_same(algorithm.state_dict(), before)
     groups = torch.stack([of_seed.lookup(embedding).group for of_seed in algorithm.groups])
     behaviors = algorithm.gwr.lookup(embedding.expand(2, 3, 4, 32)).embedding

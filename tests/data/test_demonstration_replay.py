@@ -12,14 +12,9 @@ from bgpo_trl.data.demonstration_replay import DemonstrationReplay
 CONSTANT = ["behavior", "label"]
 
 
-def generators(n, first=0):
-    return [torch.Generator().manual_seed(first + seed) for seed in range(n)]
-
-
-def make(bank, n_seeds=2, first=0, **options):
-    return DemonstrationReplay(
-        bank, generator=generators(n_seeds, first), constant_keys=CONSTANT, **options
-    )
+def make(bank, n_seeds=2, **options):
+    streams = [torch.Generator().manual_seed(seed) for seed in range(n_seeds)]
+    return DemonstrationReplay(bank, generator=streams, constant_keys=CONSTANT, **options)
 
 
 def episode(*index):

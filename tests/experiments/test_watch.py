@@ -14,15 +14,11 @@ from tests.helpers import contents
 GREEN, RED = (0x00, 0x9E, 0x73), (0xD5, 0x5E, 0x00)
 
 
-@pytest.fixture
-def undemonstrated(monkeypatch):
-    """Demonstrations that take no time and show nothing; films without a long last frame."""
+@pytest.mark.parametrize("name", ["bgpo", "oracle"])
+def test_a_film_has_its_files_and_leaves_the_run_unchanged(run_of, tmp_path, monkeypatch, name):
+    """With demonstrations that take no time and show nothing."""
     frames = np.random.default_rng(0).integers(256, size=(7, 32, 64, 3), dtype=np.uint8)
     monkeypatch.setattr(watch, "demonstrate", lambda tasks, *_: dict.fromkeys(tasks, frames))
-
-
-@pytest.mark.parametrize("name", ["bgpo", "oracle"])
-def test_a_film_has_its_files_and_leaves_the_run_unchanged(run_of, undemonstrated, tmp_path, name):
     run, out = run_of(name), tmp_path / "pictures"
     before = contents(run)
     printed = watch.watch(watch.WatchArguments(run, run_seed=8, out=out))

@@ -16,16 +16,11 @@ NAN = np.nan
 HEAD = "algorithm,seed,episode,env_steps,task,success,return,steps\n"
 
 
-def write(path, rows):
-    lines = [f"bgpo,{seed},{episode},9,{task},{s},{s}.0,5" for seed, episode, task, s in rows]
-    path.write_text(HEAD + "".join(line + "\n" for line in lines))
-    return path
-
-
 def test_success_is_read_by_seed_evaluation_and_task(tmp_path):
     rows = [(7, 20, "b", 1), (7, 20, "b", 0), (7, 20, "a", 0), (7, 10, "a", 1)]
     rows += [(2, 10, "a", 0), (2, 20, "a", 1), (2, 20, "b", 1), (2, 20, "b", 1)]
-    write(tmp_path / "eval.csv", rows)
+    lines = [f"bgpo,{seed},{episode},9,{task},{s},{s}.0,5\n" for seed, episode, task, s in rows]
+    (tmp_path / "eval.csv").write_text(HEAD + "".join(lines))
     config = {"seeds": [2, 7], "tasks": ["a", "b"], "task_starts": [0, 10], "episodes": 20}
     config |= {"name": "bgpo", "schedule": "practised", "eval_every": 10}
     (tmp_path / "config.json").write_text(json.dumps(config))

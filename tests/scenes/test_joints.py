@@ -62,10 +62,6 @@ def run(made, folder, name="bgpo", algorithm=JOINED):
     return finish(trainer_of(folder, made[1:], run_config(name, algorithm, task_starts=(0, 0))))
 
 
-def scaled(readings):
-    return (readings - torch.tensor(CENTER)) / torch.tensor(SCALE)
-
-
 def farthest(states, recorded):
     """Return how far the last two features are from the nearest recorded ones, at most."""
     ways = states[..., -2:].flatten(0, 1).unsqueeze(1) - recorded
@@ -120,7 +116,7 @@ def test_replays_hold_joints_as_policies_read_them(made, dot, tmp_path):
     shown = algorithm.shown.draw(groups)
     imitated = algorithm.shown.draw_actions(groups)
     assert algorithm.in_keys == ["latent_and_joints", "context"]
-    recorded = scaled(made[2].steps.joints)
+    recorded = (made[2].steps.joints - torch.tensor(CENTER)) / torch.tensor(SCALE)
     for key in ("latent_and_joints", ("next", "latent_and_joints")):
         assert farthest(shown[key], recorded) < 1e-6
     assert farthest(imitated["latent_and_joints"], recorded) < 1e-6

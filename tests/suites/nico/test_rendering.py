@@ -15,11 +15,6 @@ from suites.nico.rendering import FrameRenderer
 from suites.opengl import choose_backend, explain
 
 
-@pytest.fixture
-def on_linux(monkeypatch):
-    monkeypatch.setattr(platform, "system", lambda: "Linux")
-
-
 @pytest.mark.parametrize(
     ("chosen", "screen", "libraries", "expected"),
     [
@@ -35,8 +30,9 @@ def on_linux(monkeypatch):
     ],
 )
 def test_the_backend_is_that_of_the_user_or_the_first_that_can_be_loaded(
-    on_linux, monkeypatch, chosen, screen, libraries, expected
+    monkeypatch, chosen, screen, libraries, expected
 ):
+    monkeypatch.setattr(platform, "system", lambda: "Linux")
     for name, value in (("MUJOCO_GL", chosen), ("DISPLAY", screen), ("WAYLAND_DISPLAY", "")):
         monkeypatch.setenv(name, value)
     if " " not in expected:
