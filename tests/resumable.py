@@ -13,7 +13,7 @@ from bgpo_trl.scenes import SCENES
 from bgpo_trl.scenes.nico import NICO
 from bgpo_trl.training import Trainer
 from tests.conftest import EASY
-from tests.helpers import TINY_ENCODERS
+from tests.helpers import TINY_ENCODERS, finish
 
 RECORDING = {"per_task": 2, "held_out_per_task": 1}
 LONGER = {
@@ -28,10 +28,8 @@ def play(directory, parts):
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(SCENES, "nico", EASY)
         config, bank, encoders = torch.load(parts, weights_only=False)
-        with Trainer(
-            config, directory, bank=bank, encoders=encoders, resume=True, progress=False
-        ) as trainer:
-            trainer.run()
+        parts = {"bank": bank, "encoders": encoders, "resume": True, "progress": False}
+        finish(Trainer(config, directory, **parts))
 
 
 def train_small_encoders(directory):

@@ -9,7 +9,6 @@ import shlex
 import sys
 from pathlib import Path
 from types import ModuleType
-from unittest import mock
 
 import pytest
 import torch
@@ -96,8 +95,7 @@ def run(script, arguments, monkeypatch):
 def test_the_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     namespace = {}
-    # Restores the registry to which pages add entries.
-    with torch.random.fork_rng(devices=[]), mock.patch.dict(ALGORITHMS):
+    with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         for number, block in enumerate(blocks(page, "python"), 1):
             exec(compile(block, f"{page.name}, python block {number}", "exec"), namespace)
