@@ -181,7 +181,8 @@ WRONG = {
     "schedule in parts": (lambda: TaskSchedule((0, 0.5)), "0.5"),
     "NaN demonstration": (lambda: DemonstrationSource(bank(value=NAN), TaskSchedule()), "NaN"),
     "lookup without a source": (
-        lambda: world(BehaviorLookup(GWRB(32), learn=True)).reset(), "found no 'demo_embedding'"),
+        lambda: world(BehaviorLookup(GWRB(32), learn=True)).reset(),
+        "found no 'demo_embedding': put DemonstrationSource before it"),
     "lookup in another size": (
         lambda: world(source(), BehaviorLookup(GWRB(16), learn=True)).reset(), "got [32]"),
     "lookup of nothing": (
