@@ -11,10 +11,11 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
+from torchrl.envs import Compose, TransformedEnv
 
 from bgpo_trl.algorithms import Algorithm
 from bgpo_trl.algorithms.algorithm import Policy, read_joints
-from bgpo_trl.algorithms.environments import observation_env
+from bgpo_trl.algorithms.environments import bound, encode
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.representation import Representation
@@ -107,7 +108,8 @@ class Evaluator:
             observation="pixels" if learner.state == "latent" else "state",
         )
         joints = read_joints(learner, scene)
-        self.env = observation_env(learner, self.simulation, encoders, scene.state, joints)
+        observe = [encode(learner, encoders, scene.state), *bound(learner, joints)]
+        self.env = TransformedEnv(self.simulation, Compose(observe))
         self._task = torch.arange(n_tasks)[:, None].expand(self.shape).contiguous()
         self._next = 0
         self._waiting: list[list[Snapshot]] = [[] for _ in config.seeds]

@@ -22,7 +22,7 @@ from torchrl.envs import Compose
 
 from bgpo_trl.algorithms import Algorithm, entry
 from bgpo_trl.algorithms.algorithm import Policy
-from bgpo_trl.algorithms.environments import beside_joints, clip, encode
+from bgpo_trl.algorithms.environments import bound, encode
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.dataset import resize_frames
@@ -125,8 +125,7 @@ class TrainedPolicy:
         self.episodes = run.episodes[self._index]
         config = run.config.algorithm
         self._joints = run.algorithm.joints
-        observe = [encode(config, run.encoders), *beside_joints(self._joints), *clip(config)]
-        self._observe = Compose(observe)
+        self._observe = Compose([encode(config, run.encoders), *bound(config, self._joints)])
         self._policy: Policy | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -12,9 +12,9 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.func import functional_call
-from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, Transform, TransformedEnv
 
-from bgpo_trl.algorithms.environments import beside_joints, clip, training_env
+from bgpo_trl.algorithms.environments import bound, encode
 from bgpo_trl.algorithms.proposal_trials import ProposalTrials
 from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import AlgorithmConfig
@@ -26,7 +26,7 @@ from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.scenes import Scene, StateColumns, find_scene
 from bgpo_trl.seeding import generators
-from bgpo_trl.transforms import DemonstrationSource
+from bgpo_trl.transforms import BehaviorMatchingReward, DemonstrationSource
 
 
 def read_joints(config: AlgorithmConfig, scene: Scene) -> StateColumns | None:
@@ -199,19 +199,29 @@ class Algorithm(ABC):
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
         """Return the environment of training episodes: simulations ``[S]`` within transforms.
 
-        ``source`` is the transform that draws task and demonstration of each episode. By default,
-        it is `training_env` with `conditioning`.
+        ``source`` is the transform that draws task and demonstration of each episode. BGPO has all
+        parts; each ablation and baseline omits some.
+
+        Raises:
+            ValueError: If the intrinsic reward needs encoders and there are none.
         """
-        return training_env(
-            self.config,
-            base_env,
-            source,
-            self.encoders,
-            state=self.scene.state,
-            joints=self.joints,
-            conditioning=self.conditioning,
-            beta=self.beta,
-        )
+        config = self.config
+        transforms: list[Transform] = [
+            encode(config, self.encoders, self.scene.state),  # pixels -> latent
+            StepCounter(
+                config.max_steps, "truncated" if config.timeouts_bootstrap else "terminated"
+            ),
+            source,  # -> task, demo_embedding
+            # -> behavior, group, expert, context
+            *(transform.clone() for transform in self.conditioning),
+        ]
+        if self.beta:
+            if self.encoders is None:
+                raise ValueError("matching behaviors needs trained encoders")
+            # reward + beta * exp(-||b - phi_g||)
+            transforms.append(BehaviorMatchingReward(self.encoders.lae, self.beta))
+        transforms += [*bound(config, self.joints), RewardSum()]  # episode_reward, ...
+        return TransformedEnv(base_env, Compose(transforms))
 
     @torch.no_grad()
     def condition(self, index: int, embedding: Tensor, task: Tensor) -> TensorDictBase:
@@ -401,8 +411,7 @@ class Algorithm(ABC):
         # Scaled and bounded as in episodes; latents of none.
         frames = len(steps.joints)
         seen = TensorDict({"latent": torch.empty(frames, 0), "joints": steps.joints}, [frames])
-        observe = Compose([*beside_joints(columns), *clip(self.config)])
-        return observe(seen)[self.config.observed]
+        return Compose(bound(self.config, columns))(seen)[self.config.observed]
 
     def sample(
         self,

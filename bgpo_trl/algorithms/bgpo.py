@@ -8,9 +8,10 @@ from typing import Any, cast
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torch.nn.functional import one_hot
+from torchrl.envs import ObservationNorm, RenameTransform, Transform, UnaryTransform
 
 from bgpo_trl.algorithms.algorithm import Algorithm, Policy
-from bgpo_trl.algorithms.environments import conditioning_on
 from bgpo_trl.algorithms.experts import ActiveGroups, Experts
 from bgpo_trl.algorithms.rl import Learner, LearnerSpec, make_learner
 from bgpo_trl.configs import BGPOConfig
@@ -19,6 +20,7 @@ from bgpo_trl.data.demonstration_replay import DemonstrationReplay
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.seeding import generators, stream_seed
+from bgpo_trl.transforms import BehaviorLookup, GroupLookup
 from bgpo_trl.transforms.behavior_matching import matching_reward
 
 
@@ -95,14 +97,31 @@ class BGPO(Algorithm):
         if self.shown is not None and config.experts:
             steps = cast(DemonstrationSteps, self.bank.steps)
             self.starts = steps.latents(steps.first)
-        self.conditioning = conditioning_on(
-            config.context,
-            n_tasks=self.n_tasks,
-            behavior_scale=config.behavior_scale,
-            gwr=self.gwr,
-            groups=self.groups,
-            starts=self.starts,
-        )
+        self.conditioning = self._conditioning()
+
+    def _conditioning(self) -> list[Transform]:
+        """Return the transforms by which policies are conditioned on a demonstration.
+
+        Within an environment, GWR-B and groups learn from it when the episode ends. Called on a
+        TensorDict, the same transforms only look up.
+        """
+        context, n_tasks, transforms = self.config.context, self.n_tasks, list[Transform]()
+        if self.gwr is not None:
+            transforms.append(BehaviorLookup(self.gwr, learn=True))  # demo_embedding -> behavior
+        elif context == "embedding":
+            transforms.append(RenameTransform(["demo_embedding"], ["behavior"], create_copy=True))
+        if self.groups:  # -> group, expert
+            transforms.append(GroupLookup(self.groups, learn=True, starts=self.starts))
+        if context == "label":
+            transforms.append(
+                UnaryTransform(
+                    ["task"], ["context"], fn=lambda task: one_hot(task, n_tasks).float()
+                )
+            )
+        elif context is not None:
+            scale = self.config.behavior_scale
+            transforms.append(ObservationNorm(0.0, scale, ["behavior"], ["context"]))
+        return transforms
 
     def make_learner(self, spec: LearnerSpec) -> Learner:
         """Return the learner; an own RL algorithm overrides this."""
