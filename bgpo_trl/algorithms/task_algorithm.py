@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bgpo_trl.algorithms.algorithm import Algorithm
 from bgpo_trl.algorithms.rl import LearnerSpec
-from bgpo_trl.configs import DistNLLConfig, MAMLConfig
+from bgpo_trl.configs.algorithms import TaskConfig
 
 
 class TaskAlgorithm(Algorithm):
@@ -23,9 +23,9 @@ class TaskAlgorithm(Algorithm):
         spec: Shapes and inputs of the networks, one per task.
     """
 
-    config: MAMLConfig | DistNLLConfig
+    config: TaskConfig
 
-    def __init__(self, config: MAMLConfig | DistNLLConfig, **arguments: Any) -> None:
+    def __init__(self, config: TaskConfig, **arguments: Any) -> None:
         super().__init__(config, **arguments)
         self.spec = LearnerSpec(
             seeds=self.seeds,

@@ -177,31 +177,24 @@ class AlgorithmConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        share = self.demonstration_share
+        share, rl = self.demonstration_share, self.rl
+        beside = self.state == "latent" or not self.joints
+        imitable = "above 0 for a policy to imitate (bgpo-experts: without)"
         check(
             self,
             ("demonstration_share", 0 <= share < 1, "at least 0 and below 1"),
-        )
-        beside = self.state == "latent" or not self.joints
-        check(self, ("joints", beside, "off with state='state', which tells more"))
-        shown = share > 0 or not self.rl.imitates
-        check(
-            self,
-            (
-                "demonstration_share",
-                shown,
-                "above 0 for a policy to imitate (bgpo-experts: without)",
-            ),
+            ("joints", beside, "off with state='state', which tells more"),
+            ("demonstration_share", share > 0 or not rl.imitates, imitable),
         )
         at_least(self, 1, "max_steps")
         if self.state_limit is not None:
             positive(self, "state_limit")
         if self.demonstration_noise is not None:
             at_least(self, 0, "demonstration_noise")
-        if share and self.rl.warmup_steps < self.max_steps:
+        if share and rl.warmup_steps < self.max_steps:
             # Else, seeds would learn from demonstrations sooner or later than each would alone.
             raise ValueError(
-                f"with a demonstration_share, warmup_steps ({self.rl.warmup_steps}) must be at "
+                f"with a demonstration_share, warmup_steps ({rl.warmup_steps}) must be at "
                 f"least max_steps ({self.max_steps}), so that each seed has ended one episode"
             )
 
@@ -358,9 +351,6 @@ class EWCConfig(FineTuningConfig):
     fisher_samples: int = 2_560
     """Transitions from which the Fisher information of a task is estimated (Continual World)."""
 
-    rl: RLConfig = field(default_factory=RLConfig)
-    """DDPG, whose learner it uses."""
-
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least(self, 0, "ewc_weight")
@@ -368,25 +358,34 @@ class EWCConfig(FineTuningConfig):
 
 
 @dataclass(frozen=True)
-class MAMLConfig(AlgorithmConfig):
+class TaskConfig(AlgorithmConfig):
+    """Hyperparameters of the algorithms that know the task label."""
+
+    task_batch_size: int = 64
+    """Transitions of each task per update. Ours: with three tasks, as many as in an update of BGPO.
+    MAML adapts to one half and evaluates the adapted policy on the other."""
+    share_batch: bool = False
+    """Whether the tasks share ``task_batch_size`` transitions in equal parts."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, 1, "task_batch_size")
+        _check_played(self, self.task_batch_size)
+        _check_literal(self, "share_batch", self.share_batch)
+
+
+@dataclass(frozen=True)
+class MAMLConfig(TaskConfig):
     """Model-agnostic meta-learning over DDPG (Sec. IV-B; Finn et al., 2017)."""
 
     inner_learning_rate: float = 1.0
     """Step size of the gradient step that adapts the policy to a task. Ours: large enough to change
     the policy's actions."""
-    task_batch_size: int = 64
-    """Transitions of each task per update: half to adapt to, half to evaluate the adapted policy.
-    Ours: with three tasks, as many transitions as in an update of BGPO."""
-    share_batch: bool = False
-    """Whether the tasks share ``task_batch_size`` transitions in equal parts."""
     adaptation_size: int = 256
     """Transitions of the test task to adapt to before its test episodes. Ours: Sec. IV-B has "256
     adaptation trajectories", about 50 times as much."""
     adapt_to_latest: bool = False
     """Whether these are the latest transitions of the task, instead of being drawn from all."""
-
-    rl: RLConfig = field(default_factory=RLConfig)
-    """DDPG, whose learner it uses."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -394,22 +393,14 @@ class MAMLConfig(AlgorithmConfig):
         at_least(self, 1, "adaptation_size")
         alone = self.rl.proposals == "actor"
         check(self, ("rl", alone, "of an actor without clone, since MAML adapts one policy"))
-        at_least(self, 2, "task_batch_size")
         check(self, ("task_batch_size", self.task_batch_size % 2 == 0, "even"))
-        _check_played(self, self.task_batch_size)
-        _check_literal(self, "share_batch", self.share_batch)
         _check_literal(self, "adapt_to_latest", self.adapt_to_latest)
 
 
 @dataclass(frozen=True)
-class DistNLLConfig(AlgorithmConfig):
+class DistNLLConfig(TaskConfig):
     """Policy distillation with a negative log-likelihood (Sec. IV-B; Rusu et al., 2016)."""
 
-    task_batch_size: int = 64
-    """Transitions of each task in an update of its teacher. Ours: with three tasks, as many
-    transitions as in an update of BGPO."""
-    share_batch: bool = False
-    """Whether the tasks share ``task_batch_size`` transitions in equal parts."""
     samples: int = 1_000
     """States of each task from which its head learns at the end of an episode (Sec. IV-B)."""
     distillation_batch_size: int = 125
@@ -418,12 +409,7 @@ class DistNLLConfig(AlgorithmConfig):
     learning_rate: float = 1e-3
     """Learning rate of Adam for the multi-task policy. Ours: the teachers'."""
 
-    rl: RLConfig = field(default_factory=RLConfig)
-    """DDPG, by which the teachers learn."""
-
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(self, 1, "task_batch_size", "samples", "distillation_batch_size")
-        _check_played(self, self.task_batch_size)
-        _check_literal(self, "share_batch", self.share_batch)
+        at_least(self, 1, "samples", "distillation_batch_size")
         positive(self, "learning_rate")
