@@ -172,16 +172,8 @@ class FrameRenderer:
         make = functools.partial(FrameRenderer, height=height, width=width)
         return make, (self._model, self._camera_name)
 
-    def render(self, data: mujoco.MjData, out: np.ndarray | None = None) -> np.ndarray:
-        """Render a frame.
-
-        Args:
-            data: State of the simulation.
-            out: Array to write into, uint8 ``[height, width, 3]``; a new one if ``None``.
-
-        Returns:
-            RGB frame, uint8 ``[height, width, 3]``.
-        """
+    def render(self, data: mujoco.MjData) -> np.ndarray:
+        """Return an RGB frame of a simulation's state, uint8 ``[height, width, 3]``."""
         with _turn:
             self._renderer.update_scene(data, self._camera)
             if self._taller > 1.0:
@@ -189,7 +181,7 @@ class FrameRenderer:
                     camera.frustum_bottom *= self._taller
                     camera.frustum_top *= self._taller
             try:
-                return self._renderer.render(out=out)
+                return self._renderer.render()
             finally:
                 _leave()
 
