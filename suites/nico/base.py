@@ -58,19 +58,6 @@ def scene_version() -> str:
     return "nico-2-" + hashlib.sha256(described).hexdigest()[:8]
 
 
-def check_observation(observation: str) -> None:
-    """Raise ``ValueError`` if there is no such observation."""
-    if observation not in get_args(Observation):
-        choices = ", ".join(map(repr, get_args(Observation)))
-        raise ValueError(f"observation is {observation!r}; choose one of {choices}")
-
-
-def check_spread(spread: float) -> None:
-    """Raise ``ValueError`` if there is no such spread of the start states."""
-    if not 0.0 <= spread <= 1.0:
-        raise ValueError(f"spread is {spread}: choose a number from 0 (nominal places) to 1")
-
-
 def nominal_places() -> np.ndarray:
     """Return the place of the center of each of `OBJECTS` at spread 0 (m), ``[3, 3]``."""
     return np.array(
@@ -135,8 +122,9 @@ class NicoTask(control.Task):
             `nominal_places`, unturned, and the half-open hand is above the green box. In between,
             all deviations from that are scaled, and glass and white box swap sides with probability
             ``spread / 2``.
-        observation: ``"pixels"`` (uint8 ``[32, 64, 3]``), ``"state"`` (``privileged_state``,
-            float64 ``[16]``) or ``"both"``.
+        observation: ``"pixels"`` (uint8 ``[32, 64, 3]``), ``"state"`` (``privileged_state``, the
+            ground truth, float64 ``[16]``: joints (rad), grip and object positions (m)) or
+            ``"both"``.
         frame_size: Height and width of ``pixels``.
         renderer: Renderer shared with other environments; created on demand if ``None``.
 
@@ -159,8 +147,11 @@ class NicoTask(control.Task):
         frame_size: Sequence[int] = (FRAME_HEIGHT, FRAME_WIDTH),
         renderer: FrameRenderer | None = None,
     ) -> None:
-        check_observation(observation)
-        check_spread(spread)
+        if observation not in get_args(Observation):
+            choices = ", ".join(map(repr, get_args(Observation)))
+            raise ValueError(f"observation is {observation!r}; choose one of {choices}")
+        if not 0.0 <= spread <= 1.0:
+            raise ValueError(f"spread is {spread}: choose a number from 0 (nominal places) to 1")
         if renderer is not None and renderer.frame_size != tuple(frame_size):
             raise ValueError(
                 f"frame_size is {tuple(frame_size)}, but the renderer's frames are "

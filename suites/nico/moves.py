@@ -4,6 +4,9 @@ A movement leads the hand by inverse kinematics through a few noisy waypoints: a
 of the sweep, down to the table and sideways into the object, where it may close, or from above
 onto the object. The waypoints follow the objects as they move. Phases that may get stuck, against
 the table or a neighbor, end after some steps; a movement that has failed is planned anew.
+
+Movements take the simulation at the start of the episode, the source of their noise, and the names
+of objects.
 """
 
 from collections.abc import Callable, Sequence
@@ -72,24 +75,12 @@ class Phase:
 
 
 def grasp(physics: Physics, random: np.random.Generator, name: str) -> Sequence[Phase]:
-    """Sweep the open hand left until an object is between thumb and fingers, then close it.
-
-    Args:
-        physics: The simulation at the start of the episode.
-        random: Source of the noise.
-        name: The object.
-    """
+    """Sweep the open hand left until an object is between thumb and fingers, then close it."""
     return [*_reach(physics, random, name), Phase(_stay, GRIP, limit=14)]
 
 
 def lift(physics: Physics, random: np.random.Generator, name: str) -> Sequence[Phase]:
-    """Grasp a box as in `grasp`, then raise it.
-
-    Args:
-        physics: The simulation at the start of the episode.
-        random: Source of the noise.
-        name: The box.
-    """
+    """Grasp a box as in `grasp`, then raise it."""
 
     def is_firm(physics: Physics) -> bool:
         return (physics.data.ctrl[3:] - physics.digit_curls()).mean() > _FIRM
@@ -129,14 +120,7 @@ def _reach(
 
 
 def push(physics: Physics, random: np.random.Generator, box: str, target: str) -> Sequence[Phase]:
-    """Move the fist to a box's far side from its target, then sweep the box towards the target.
-
-    Args:
-        physics: The simulation at the start of the episode.
-        random: Source of the noise.
-        box: The object to push.
-        target: The object to push it to.
-    """
+    """Move the fist to a box's far side from its target, then sweep the box towards the target."""
     side = np.sign(_angle(physics, box) - _angle(physics, target))
     return _sweep(physics, random, box, side, lambda physics: physics.object_position(target)[:2])
 
@@ -146,11 +130,7 @@ def push_aside(
 ) -> Sequence[Phase]:
     """Move the fist beside an object, then sweep the object along the arc to the other side.
 
-    Args:
-        physics: The simulation at the start of the episode.
-        random: Source of the noise.
-        name: The object.
-        side: 1 to push from the left to the right, -1 to push from the right to the left.
+    ``side`` is 1 to push from the left to the right, -1 to push from the right to the left.
     """
     start = _radius(physics, name)
 
@@ -169,12 +149,8 @@ def _sweep(
 ) -> Sequence[Phase]:
     """Return a sweep of the fist along the arc that takes an object with it.
 
-    Args:
-        physics: The simulation at the start of the episode.
-        random: Source of the noise.
-        name: The object.
-        side: 1 to start on the object's left, -1 on its right.
-        goal: Place ``[x, y]`` (m) to which the sweep leads, evaluated at each step.
+    ``side`` is 1 to start on the object's left, -1 on its right; ``goal`` returns the place
+    ``[x, y]`` (m) to which the sweep leads, evaluated at each step.
     """
     noise = random.normal(0.0, _NOISE, 3)
     away = side * random.uniform(0.012, 0.025)
@@ -203,13 +179,7 @@ def _sweep(
 
 
 def press(physics: Physics, random: np.random.Generator, name: str) -> Sequence[Phase]:
-    """Move the fist high above an object, then down onto it.
-
-    Args:
-        physics: The simulation at the start of the episode.
-        random: Source of the noise.
-        name: The object.
-    """
+    """Move the fist high above an object, then down onto it."""
     del physics
     noise = random.normal(0.0, _NOISE, 3)
     top = TABLE_HEIGHT + 2 * OBJECT_HALF_HEIGHT[name]

@@ -91,11 +91,8 @@ def load(
     Args:
         task: One of `TASKS`.
         seed: Seed or random state of the start states; ``None`` for a random seed.
-        spread: Share of the whole range of start states, from 0 (nominal places) to 1, see
-            `NicoTask`.
-        observation: ``"pixels"`` (uint8 ``[32, 64, 3]``), ``"state"`` (``privileged_state``, the
-            ground truth, float64 ``[16]``: joints (rad), grip and object positions (m)) or
-            ``"both"``.
+        spread: Share of the whole range of start states, as of `NicoTask`.
+        observation: As of `NicoTask`.
         frame_size: Height and width of ``pixels``, such as ``(84, 84)``. Narrower frames also show
             the whole table.
         time_limit: Length of an episode (s); a step takes 0.2 s.

@@ -31,7 +31,10 @@ def scene_xml() -> str:
 
 
 class Physics(dm_mujoco.Physics):
-    """MuJoCo simulation with the queries of NICO's tasks, demonstrator and probes."""
+    """MuJoCo simulation with the queries of NICO's tasks, demonstrator and probes.
+
+    Those that take the ``name`` of an object raise ``ValueError`` if it is not one of `OBJECTS`.
+    """
 
     # Indices are cached, since a lookup by `named` takes much longer than the read itself.
 
@@ -107,19 +110,11 @@ class Physics(dm_mujoco.Physics):
         return self.data.site_xpos[self._id("site", "palm")].copy()
 
     def object_position(self, name: str) -> np.ndarray:
-        """Return the center of an object (m), ``[3]``.
-
-        Raises:
-            ValueError: If ``name`` is not one of `OBJECTS`.
-        """
+        """Return the center of an object (m), ``[3]``."""
         return self.data.xpos[self._object_id("body", name)].copy()
 
     def start_position(self, name: str) -> np.ndarray:
-        """Return where an object's center was at the start of the episode (m), ``[3]``.
-
-        Raises:
-            ValueError: If ``name`` is not one of `OBJECTS`.
-        """
+        """Return where an object's center was at the start of the episode (m), ``[3]``."""
         self._object_id("body", name)
         return self.data.userdata[1:].reshape(-1, 3)[OBJECTS.index(name)].copy()
 
@@ -200,20 +195,8 @@ class Physics(dm_mujoco.Physics):
         geoms = self.data.contact.geom
         return bool((bodies[geoms] == robot).any())
 
-    def hand_closing(self) -> bool:
-        """Return whether the hand is closing: its target lies beyond its mean curl."""
-        targets = self.data.ctrl[len(ARM_JOINTS) :]
-        return bool((targets - self.digit_curls()).mean() > _PRESSING)
-
     def pressed(self, name: str) -> bool:
-        """Return whether the hand touches an object's top or another part of it from above.
-
-        Args:
-            name: One of `OBJECTS`.
-
-        Raises:
-            ValueError: If ``name`` is not one of `OBJECTS`.
-        """
+        """Return whether the hand touches an object's top or another part of it from above."""
         geom = self._object_id("geom", name)
         for contact in self.data.contact:
             # The normal points from the first geom to the second.
@@ -227,12 +210,6 @@ class Physics(dm_mujoco.Physics):
         """Return whether an object stands upright on the table, not on another of its sides.
 
         It may be moving.
-
-        Args:
-            name: One of `OBJECTS`.
-
-        Raises:
-            ValueError: If ``name`` is not one of `OBJECTS`.
         """
         body = self._object_id("body", name)
         low = self.data.xpos[body, 2] - TABLE_HEIGHT < OBJECT_HALF_HEIGHT[name] + _TOUCH_GAP
@@ -241,16 +218,12 @@ class Physics(dm_mujoco.Physics):
     def held(self, name: str) -> bool:
         """Return whether an object is between thumb and finger side of a closing hand.
 
-        A finger and the thumb or palm must touch it. It may stand or have been knocked over.
-
-        Args:
-            name: One of `OBJECTS`.
-
-        Raises:
-            ValueError: If ``name`` is not one of `OBJECTS`.
+        A finger and the thumb or palm must touch it. It may stand or have been knocked over. A hand
+        is closing if its target lies beyond its mean curl.
         """
         held = self._object_id("geom", name)
-        if not self.hand_closing():
+        lead = self.data.ctrl[len(ARM_JOINTS) :] - self.digit_curls()
+        if not lead.mean() > _PRESSING:
             return False
         touched = set()
         for contact in self.data.contact:
