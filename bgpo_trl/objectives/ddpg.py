@@ -104,7 +104,6 @@ class DDPGLoss(LossModule):
             up to ``beta + gamma * (1 + beta)``.
         pre_tanh_penalty: Weight of the mean square of the actor's output before the tanh.
         constant_keys: Entries of the networks' input that are constant within an episode.
-        delay_actor: Whether the actor has a target network, as the critics always have.
         reduction: ``"sum"`` over ``S``, or ``"none"``.
 
     Raises:
@@ -160,7 +159,6 @@ class DDPGLoss(LossModule):
         return_bounds: tuple[float, float] | None = None,
         pre_tanh_penalty: float = RLConfig.pre_tanh_penalty,
         constant_keys: Sequence[NestedKey] = (),
-        delay_actor: bool = True,
         reduction: str = "sum",
     ) -> None:
         weights = {"imitation": imitation, "pre_tanh_penalty": pre_tanh_penalty}
@@ -191,7 +189,7 @@ class DDPGLoss(LossModule):
                 f"clone_network must have the actor's batch_size {[*self.batch_size]}, got "
                 f"{[*_batch_size(clone_network)]}"
             )
-        self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
+        self.convert_to_functional(actor_network, "actor_network", create_target_params=True)
         self.convert_to_functional(value_network, "value_network", create_target_params=True)
         self.has_clone = clone_network is not None
         if clone_network is not None:
