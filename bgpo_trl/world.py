@@ -87,7 +87,3 @@ class World:
         self.env.reset()  # Transforms create their caches at the first reset.
         self.source.load_state_dict(state["source"])
         self.simulation.load_simulation_state(state["simulation"])
-
-    def close(self) -> None:
-        """Close the simulations."""
-        self.simulation.close()
