@@ -64,30 +64,19 @@ class StackedLinear(nn.Module):
         batch_size = as_shape(batch_size, "batch_size")
         self.weight = nn.Parameter(torch.empty(*batch_size, in_features, out_features))
         self.bias = nn.Parameter(torch.empty(*batch_size, out_features))
-        self.reset_parameters(generator)
+        # One generator draws all layers at once, several draw one layer each.
+        n_draws = batch_size.numel() if isinstance(generator, Sequence) else 1
+        streams, bound = one_each(generator, n_draws), 1 / math.sqrt(in_features)
+        with torch.no_grad():
+            weights, biases = self.weight.view(n_draws, -1), self.bias.view(n_draws, -1)
+            for weight, bias, stream in zip(weights, biases, streams, strict=True):
+                weight.uniform_(-bound, bound, generator=stream)
+                bias.uniform_(-bound, bound, generator=stream)
 
     @property
     def batch_size(self) -> torch.Size:
         """Leading dimensions ``S`` of the weights."""
         return self.weight.shape[:-2]
-
-    @torch.no_grad()
-    def reset_parameters(
-        self, generator: torch.Generator | Sequence[torch.Generator] | None = None
-    ) -> None:
-        """Draw all weights and biases anew; ``generator`` as in the constructor."""
-        bound = 1 / math.sqrt(self.in_features)
-        if generator is None or isinstance(generator, torch.Generator):
-            self.weight.uniform_(-bound, bound, generator=generator)
-            self.bias.uniform_(-bound, bound, generator=generator)
-            return
-        n_layers = self.batch_size.numel()
-        streams = one_each(generator, n_layers)
-        weights = self.weight.view(n_layers, self.in_features, self.out_features)
-        biases = self.bias.view(n_layers, self.out_features)
-        for weight, bias, stream in zip(weights, biases, streams, strict=True):
-            weight.uniform_(-bound, bound, generator=stream)
-            bias.uniform_(-bound, bound, generator=stream)
 
     def forward(self, input: Tensor) -> Tensor:
         """Apply each layer to its own slice of the input.
