@@ -76,12 +76,7 @@ class MAML(TaskAlgorithm):
         A task with too few transitions gets the policy without adaptation.
         """
         del embedding
-        meta = dict(self.meta_actor.named_parameters())
-        adapted = {
-            key: value.detach().unsqueeze(1).expand(-1, self.n_tasks, *value.shape[1:])
-            for key, value in meta.items()
-        }
-        tasks = self.ready_tasks()
+        adapted, tasks = self.loss.each_task(), self.ready_tasks()
         if (tasks >= 0).any():
             n_rows = self.config.adaptation_size
             if self.config.adapt_to_latest:

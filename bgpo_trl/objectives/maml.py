@@ -106,7 +106,7 @@ class MAMLLoss(DDPGLoss):
 
         They are differentiable with respect to ``meta_network``. Transitions are ``[*S, T, B]``.
         """
-        start = self._each_task()
+        start = self.each_task()
         step = grad(lambda parameters: self.policy_loss(parameters, tensordict).sum())(start)
         return {key: value - self.inner_learning_rate * step[key] for key, value in start.items()}
 
@@ -122,7 +122,8 @@ class MAMLLoss(DDPGLoss):
         distance = self.squared_distance(acted, shown)
         return loss + self.imitation_weight * self.mean_per_seed(distance, shown)
 
-    def _each_task(self) -> Parameters:
+    def each_task(self) -> Parameters:
+        """Return the policy's parameters before adaptation, as often as tasks, ``[*S, T, ...]``."""
         n_stacked = len(self.batch_size) - 1
         return {
             key: value.unsqueeze(n_stacked)
