@@ -47,11 +47,7 @@ class InverseModel(nn.Module):
         """
         episode = torch.arange(len(z)).unsqueeze(-1).expand(-1, z.shape[1] - 1)
         step = torch.arange(z.shape[1] - 1).expand_as(episode)
-        return self.infer(window(z, length, episode, step))
-
-    def infer(self, windows: Tensor) -> Tensor:
-        """Infer the actions of windows ``[..., 8 * latent_size]``, ``[..., action_size]``."""
-        return self.network(windows).clamp(-1.0, 1.0)
+        return self.network(window(z, length, episode, step)).clamp(-1.0, 1.0)
 
 
 def window(z: Tensor, length: Tensor, episode: Tensor, step: Tensor) -> Tensor:

@@ -114,7 +114,7 @@ def action_inference_loss(inverse: InverseModel, batch: TensorDictBase) -> Tenso
     Reads ``window`` ``[*B, 8 * latent_size]`` and ``action`` ``[*B, action_size]``.
     """
     window, action = _entries("action_inference_loss", batch, ["window", "action"])
-    # Without the clamp of `infer`, beyond which there would be no gradient.
+    # Without the model's clamp, beyond which there would be no gradient.
     error = (inverse.network(window) - action).square().sum(-1).mean()
     return TensorDict({"loss_inverse": error}, [])
 
