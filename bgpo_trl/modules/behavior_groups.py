@@ -273,7 +273,7 @@ class BehaviorGroups:
         if is_new and len(self.points) >= due:
             self._fit_metric(len(self.points))
             self.cluster = density_clusters(
-                self._places(self.points), smallest=self.smallest, evidence=self.evidence
+                self.points @ self._metric, smallest=self.smallest, evidence=self.evidence
             )
             self._arrange()
         return match
@@ -325,16 +325,12 @@ class BehaviorGroups:
         if n_points > 1:
             self._metric = local_whitening(self.points[:n_points])
 
-    def _places(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return points where their Euclidean distances are those of the metric."""
-        return points @ self._metric
-
     def _lookup(self, inputs: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return group and novelty ``[m]`` of inputs ``[m, d]``."""
         if not self._reach:
             return np.zeros(len(inputs), np.int64), np.full(len(inputs), np.inf)
         members, of_member = self.points[self.member], self.group[self.member]
-        distances = cdist(self._places(inputs), self._places(members))
+        distances = cdist(inputs @ self._metric, members @ self._metric)
         group = of_member[distances.argmin(1)]
         novelty = np.empty(len(inputs))
         for number in np.unique(group):
@@ -370,7 +366,7 @@ class BehaviorGroups:
 
     def _kth_distances(self, rows: NDArray[np.int64]) -> NDArray[np.floating]:
         """Return the distance of each of some demonstrations to its k-th neighbor among them."""
-        points = self._places(self.points[rows])
+        points = self.points[rows] @ self._metric
         return np.partition(cdist(points, points), self._k, axis=1)[:, self._k]
 
     def _arrange(self) -> None:
@@ -401,7 +397,7 @@ class BehaviorGroups:
         """Return the clusters, of which those that are one group have the same label."""
         labels, inside = self.cluster.copy(), np.flatnonzero(self.cluster >= 0)
         for link in self.links:
-            ends, others = self._places(self.points[[*link]]), self._places(self.points[inside])
+            ends, others = self.points[[*link]] @ self._metric, self.points[inside] @ self._metric
             nearest = cdist(ends, others).argmin(1)
             one, other = labels[inside[nearest]]
             labels[labels == other] = one

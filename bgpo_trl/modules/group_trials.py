@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+_LEAST = 3  # successes of an expert after demonstrations of another group, to join the two
+
 _Counts = dict[int, dict[int, list[int]]]  # successes and episodes, by group shown and expert
 
 
@@ -17,8 +19,6 @@ class GroupTrials:
 
     Args:
         seed: Seed of the selection.
-        successes: Of one expert after demonstrations of the other's group, by which two groups are
-            one task; see `same_task`.
 
     Attributes:
         after_own: Counts of episodes whose start fits the group shown.
@@ -26,8 +26,8 @@ class GroupTrials:
         n_trials: Number of the other episodes.
     """
 
-    def __init__(self, seed: int = 0, successes: int = 3) -> None:
-        self.seed, self.successes = seed, successes
+    def __init__(self, seed: int = 0) -> None:
+        self.seed = seed
         self.after_own: _Counts = {}
         self.after_others: _Counts = {}
         self.n_trials = 0
@@ -65,10 +65,10 @@ class GroupTrials:
     def same_task(self) -> tuple[int, int] | None:
         """Return two groups that are one task, or None.
 
-        Each one's expert has succeeded ``successes`` times after demonstrations of the other, at a
-        rate that falls short, by no more than a standard deviation, of half its rate after
-        demonstrations of its own group. With fewer successes, experts that seldom succeed
-        would be joined by chance.
+        Each one's expert has succeeded three times after demonstrations of the other, at a rate
+        that falls short, by no more than a standard deviation, of half its rate after
+        demonstrations of its own group. With fewer successes, experts that seldom succeed would be
+        joined by chance.
         """
         for one, other in combinations(sorted(self.after_others), 2):
             if self._succeeds(one, other) and self._succeeds(other, one):
@@ -79,7 +79,7 @@ class GroupTrials:
         won, episodes = self.after_others[shown].get(expert, (0, 0))
         own, of = self.after_own.get(expert, {}).get(expert, (0, 1))
         half = episodes * own / of / 2
-        return won >= max(self.successes, half - half**0.5)
+        return won >= max(_LEAST, half - half**0.5)
 
     def state_dict(self) -> dict[str, Any]:
         """Return what is counted."""

@@ -308,7 +308,12 @@ class GWRB(nn.Module):
         network = torch.arange(len(self._topologies), device=self._weights.device)
         if mask is None:
             return network
-        return network[as_mask(mask, self.batch_size).to(network.device).flatten()]
+        mask = as_tensor(mask, "mask")
+        if mask.shape != self.batch_size or mask.dtype != torch.bool:
+            raise ValueError(
+                f"mask must be bool {[*self.batch_size]}; got {mask.dtype} {[*mask.shape]}"
+            )
+        return network[mask.to(network.device).flatten()]
 
     def _part(self, values: Tensor, network: Tensor) -> Tensor:
         """Return the rows of all networks' values that belong to the given ones."""
@@ -615,14 +620,6 @@ def as_tensor(value: Numbers, name: str) -> Tensor:
             f"{name} must be a tensor, an array, or lists of equal lengths, of numbers; "
             f"got {short_repr(value)}"
         ) from None
-
-
-def as_mask(value: Numbers, shape: torch.Size) -> Tensor:
-    """Return a mask as a tensor; raise ``ValueError`` unless it is bool and of that shape."""
-    mask = as_tensor(value, "mask")
-    if mask.shape != shape or mask.dtype != torch.bool:
-        raise ValueError(f"mask must be bool {[*shape]}; got {mask.dtype} {[*mask.shape]}")
-    return mask
 
 
 def checked(phi: Tensor, weights: Tensor, name: str = "phi") -> Tensor:
