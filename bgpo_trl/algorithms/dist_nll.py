@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import torch
@@ -44,15 +43,10 @@ class DistNLL(TaskAlgorithm):
     def __init__(self, config: DistNLLConfig, **arguments: Any) -> None:
         super().__init__(config, **arguments)
         self.learner = make_learner(config.rl, self.spec)
-        streams = generators(self.seeds, "student")
-        network = partial(
-            MultiHeadActor,
-            self.state_size,
-            self.scene.action_size,
-            in_keys=[self.config.observed],
-            hidden_sizes=self.config.rl.hidden_sizes,
-        )
-        self.students = [network(generator=stream).to(self.device) for stream in streams]
+        self.students: list[MultiHeadActor] = [
+            self.spec.network(MultiHeadActor, config.rl, (), stream)
+            for stream in generators(self.seeds, "student")
+        ]
         # By seed: the task of each head, in order of appearance.
         self._head_tasks: list[list[int]] = [[] for _ in self.seeds]
         self._heads = generators(self.seeds, "heads")
@@ -62,12 +56,7 @@ class DistNLL(TaskAlgorithm):
         ]
         self._ended = torch.zeros(self.n_seeds, dtype=torch.bool)
         # Called with the parameters of a `Policy`.
-        self.test_actor = Actor(
-            self.state_size,
-            self.scene.action_size,
-            in_keys=[self.config.observed],
-            hidden_sizes=self.config.rl.hidden_sizes,
-        ).to(self.device)
+        self.test_actor = self.spec.network(Actor, config.rl, (), None)
 
     def store(self, transition: TensorDictBase) -> None:
         """Add a transition of each seed to the replay of its task."""

@@ -40,14 +40,8 @@ class MAML(TaskAlgorithm):
     def __init__(self, config: MAMLConfig, **arguments: Any) -> None:
         super().__init__(config, **arguments)
         rl = config.rl
-        self.meta_actor = Actor(
-            self.state_size,
-            self.scene.action_size,
-            batch_size=[self.n_seeds],
-            generator=generators(self.seeds, "actor"),
-            in_keys=self.spec.in_keys,
-            hidden_sizes=rl.hidden_sizes,
-        ).to(self.device)
+        streams = generators(self.seeds, "actor")
+        self.meta_actor = self.spec.network(Actor, rl, [self.n_seeds], streams)
         self.loss = MAMLLoss(
             self.meta_actor,
             self.spec.actor(rl),

@@ -270,7 +270,7 @@ class LearnerSpec:
 
     def actor(self, config: RLConfig, name: str = "actor") -> Actor:
         """Return policies ``[S, E]``, whose initial weights come from the stream ``name``."""
-        return self._network(Actor, config, self._shape, self.generators(name))
+        return self.network(Actor, config, self._shape, self.generators(name))
 
     def critic(self, config: RLConfig) -> Critic:
         """Return Q-functions ``[S, E]``, or ``[S, E, N]`` if there are several critics."""
@@ -278,7 +278,7 @@ class LearnerSpec:
         names = ["critic", *(f"critic {number} of" for number in range(1, config.critics))]
         each = zip(*(self.generators(name) for name in names), strict=True)
         norm, streams = config.critic_layer_norm, [stream for of in each for stream in of]
-        return self._network(Critic, config, shape, streams, layer_norm=norm)
+        return self.network(Critic, config, shape, streams, layer_norm=norm)
 
     def loss_options(self, config: RLConfig) -> dict[str, Any]:
         """Return the common arguments of the losses."""
@@ -296,15 +296,16 @@ class LearnerSpec:
     def _shape(self) -> list[int]:
         return [len(self.seeds), len(self.experts)]
 
-    def _network(
+    def network(
         self,
-        network: Callable[..., Any],
+        kind: Callable[..., Any],
         config: RLConfig,
         batch_size: Sequence[int],
-        generator: Sequence[torch.Generator],
+        generator: torch.Generator | Sequence[torch.Generator] | None,
         **options: Any,
     ) -> Any:
-        made = network(
+        """Return a network of these inputs and actions, such as an `Actor`, on the device."""
+        made = kind(
             self.in_features,
             self.action_size,
             in_keys=self.in_keys,
