@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
 
 from bgpo_trl.algorithms import Algorithm
-from bgpo_trl.algorithms.algorithm import Policy, read_joints
+from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.environments import bound, encode
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
@@ -107,7 +107,7 @@ class Evaluator:
             spread=config.spread,
             observation="pixels" if learner.state == "latent" else "state",
         )
-        joints = read_joints(learner, scene)
+        joints = scene.joints if learner.joints else None
         observe = [encode(learner, encoders, scene.state), *bound(learner, joints)]
         self.env = TransformedEnv(self.simulation, Compose(observe))
         self._task = torch.arange(n_tasks)[:, None].expand(self.shape).contiguous()

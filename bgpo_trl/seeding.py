@@ -62,12 +62,8 @@ def one_each(
 ) -> Sequence[torch.Generator | None]:
     """Return a source of random numbers for each of ``count`` things.
 
-    Args:
-        generator: One for all, one for each, or None for torch's default generator.
-        count: Number of things.
-
-    Raises:
-        ValueError: If there are not as many, or they are something else.
+    ``generator`` is one for all, one for each, or None for torch's default generator; raise
+    ``ValueError`` if there are not as many, or they are something else.
     """
     sources = generator if isinstance(generator, Sequence) else [generator] * count
     kinds = (torch.Generator, type(None))

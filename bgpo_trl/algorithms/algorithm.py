@@ -24,25 +24,9 @@ from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.scenes import Scene, StateColumns, find_scene
+from bgpo_trl.scenes import Scene, find_scene
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import BehaviorMatchingReward, DemonstrationSource
-
-
-def read_joints(config: AlgorithmConfig, scene: Scene) -> StateColumns | None:
-    """Return the scale of the joints if policies read them, else None.
-
-    Raises:
-        ValueError: If they are to read joints that the scene does not have.
-    """
-    if not config.joints:
-        return None
-    if scene.joints is None:
-        raise ValueError(
-            f"the scene {scene.name!r} has no joints for policies to read: set joints to False, or "
-            "give it Scene.joints and its simulation joints() (docs/extending.md)"
-        )
-    return scene.joints
 
 
 @dataclass(frozen=True)
@@ -178,9 +162,14 @@ class Algorithm(ABC):
             raise ValueError("state='latent' needs trained encoders")
         else:
             self.state_size = encoders.frame_network.latent_size
-        self.joints = read_joints(config, self.scene)
+        self.joints = self.scene.joints if config.joints else None
         if self.joints is not None:
             self.state_size += self.joints.size
+        elif config.joints:
+            raise ValueError(
+                f"the scene {self.scene.name!r} has no joints for policies to read: set joints to "
+                "False, or give it Scene.joints and its simulation joints() (docs/extending.md)"
+            )
         if bank.steps is not None and bank.steps.action.shape[-1] != self.scene.action_size:
             raise ValueError(
                 f"actions of the demonstrations have {bank.steps.action.shape[-1]} components, "
@@ -227,13 +216,8 @@ class Algorithm(ABC):
     def condition(self, index: int, embedding: Tensor, task: Tensor) -> TensorDictBase:
         """Return what the policy of one seed is conditioned on, ``[*B]``; learn nothing.
 
-        Args:
-            index: Position of the seed in the batch.
-            embedding: phi of the demonstrations, ``[*B, 32]``.
-            task: Their labels, int64 ``[*B]``.
-
-        Returns:
-            ``demo_embedding``, ``task`` and the entries that `conditioning` writes.
+        This is ``demo_embedding``, ``task`` and the entries that `conditioning` writes. Arguments
+        are those of `snapshot`.
         """
         shape = (self.n_seeds, *task.shape)
         shown = {"demo_embedding": embedding.expand(*shape, -1), "task": task.expand(shape)}

@@ -219,7 +219,11 @@ class BGPO(Algorithm):
             raise ValueError("offline updates need a demonstration_share above 0")
         with torch.no_grad():
             for row in rows:
-                self._learn_demonstrations(row)
+                phi = self.bank.embedding[row]
+                if self.gwr is not None:
+                    self.gwr.adapt(phi)
+                for groups, own, at in zip(self.groups, phi, row.tolist(), strict=False):
+                    groups.adapt(own, None if self.starts is None else self.starts[at])
             for row in rows:
                 episode = self._episode_of(row)
                 self._store_demonstration(self.shown, episode, self._number(episode, "group"))
@@ -229,14 +233,6 @@ class BGPO(Algorithm):
             with torch.no_grad():
                 self._play([of_seed[update * len(of_seed) // n_updates] for of_seed in numbers])
             yield self._learn_active(share=None if len(self.replay) else 1.0)
-
-    def _learn_demonstrations(self, rows: Tensor) -> None:
-        """Have GWR-B and groups learn one demonstration of each seed, ``[S]``."""
-        phi = self.bank.embedding[rows]
-        if self.gwr is not None:
-            self.gwr.adapt(phi)
-        for groups, own, row in zip(self.groups, phi, rows.tolist(), strict=False):
-            groups.adapt(own, None if self.starts is None else self.starts[row])
 
     def _episode_of(self, rows: Tensor) -> TensorDictBase:
         """Return the end of an episode that showed one demonstration of each seed, ``[S]``."""

@@ -82,11 +82,8 @@ class FrameNetwork(nn.Module):
                 f"{type(self).__name__}.features() must return [{len(frames)}, {self.latent_size}] "
                 f"for {len(frames)} frames, got {[*made.shape]}"
             )
-        return self.standardize(made).reshape(*pixels.shape[:-3], self.latent_size)
-
-    def standardize(self, features: Tensor) -> Tensor:
-        """Return ``(features - latent_mean) / latent_std``, ``[..., latent_size]``."""
-        return (features - self.latent_mean) / self.latent_std
+        standardized = (made - self.latent_mean) / self.latent_std
+        return standardized.reshape(*pixels.shape[:-3], self.latent_size)
 
     @torch.no_grad()
     def set_latent_scale(self, features: Tensor, floor: float = 0.1) -> None:
@@ -133,10 +130,6 @@ class FrameNetworkError(ValueError):
 
 def make_frame_network(name: str, frame_shape: Sequence[int]) -> FrameNetwork:
     """Return a new frame network of `FRAME_NETWORKS`, in eval mode, without gradients.
-
-    Args:
-        name: Its name.
-        frame_shape: Height and width of a frame.
 
     Raises:
         FrameNetworkError: If there is none of this name, or it is not what its entry says.
