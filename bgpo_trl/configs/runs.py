@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from numbers import Integral
 from typing import Literal
 
 from tyro.conf import Fixed
@@ -17,9 +16,7 @@ PAPER_TASKS = ("grasp_glass", "push_green_to_glass", "push_green_to_white")
 
 
 def check_seeds(seeds: Sequence[int]) -> None:
-    """Raise ``ValueError`` unless seeds are whole numbers, different, and none is negative."""
-    if not all(isinstance(seed, Integral) for seed in seeds):
-        raise ValueError(f"seeds must be whole numbers, got {seeds}")
+    """Raise ``ValueError`` unless there are seeds, all different, and none is negative."""
     if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < 0:
         raise ValueError(f"seeds must be one or more, all different and none negative: {seeds}")
 
