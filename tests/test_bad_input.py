@@ -15,6 +15,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.envs import Compose, StepCounter, TransformedEnv
 
+from bgpo_trl.configs import VAEConfig
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.pretrained import bank_path, default_weights, load_pretrained
 from bgpo_trl.encoders.representation import load_representation
@@ -154,11 +155,13 @@ WRONG = {
     "distillation without spread": (
         lambda: distillation_loss(actor(), transitions().set("teacher_action", torch.zeros(8, 4))),
         "from its actor, found no 'loc', 'scale'"),
-    "windows of one frame": (lambda: vae_inverse_loss(VAE(), windows(2, 1)), "(2, 1, 32"),
+    "windows of one frame": (
+        lambda: vae_inverse_loss(VAE(), windows(2, 1), VAEConfig()), "(2, 1, 32"),
     "windows without actions": (
-        lambda: vae_inverse_loss(VAE(), windows(2, 2).exclude("action")), "no 'action'"),
+        lambda: vae_inverse_loss(VAE(), windows(2, 2).exclude("action"), VAEConfig()),
+        "no 'action'"),
     "actions of another robot": (
-        lambda: vae_inverse_loss(VAE(), windows(2, 2, action=7)), "got [2, 2, 7]"),
+        lambda: vae_inverse_loss(VAE(), windows(2, 2, action=7), VAEConfig()), "got [2, 2, 7]"),
     "sequences without lengths": (
         lambda: sequence_reconstruction_loss(lae, TensorDict({"latent": z}, [2])), "no 'length'"),
     # the world

@@ -311,14 +311,7 @@ def _train_vae(datasets: Sequence[TensorDictBase], frames: Tensor, fit: Fit) -> 
     vae = initialized(fit.config.seed, VAE, *sizes)
     vae.mean_frame.copy_(mean_frame(frames))
     generator = fit.generator()
-    loss_of = partial(
-        vae_inverse_loss,
-        reconstruction_weight=config.reconstruction_weight,
-        foreground_weight=config.foreground_weight,
-        kl_weight=config.kl_weight,
-        inverse_weight=config.inverse_weight,
-        generator=generator,
-    )
+    loss_of = partial(vae_inverse_loss, config=config, generator=generator)
     bfloat16 = config.bfloat16 and has_bfloat16(torch.device(fit.device))
     if config.bfloat16 and not bfloat16:
         emulated = "this processor has no instructions for bfloat16: computing in float32"

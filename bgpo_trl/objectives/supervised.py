@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn.functional import gaussian_nll_loss
 
+from bgpo_trl.configs import VAEConfig
 from bgpo_trl.errors import missing_key
 from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
@@ -26,11 +27,8 @@ def _entries(reader: str, batch: TensorDictBase, keys: Sequence[NestedKey]) -> l
 def vae_inverse_loss(
     vae: VAE,
     windows: TensorDictBase,
+    config: VAEConfig,
     *,
-    reconstruction_weight: float = 1.0,
-    foreground_weight: float = 0.0,
-    kl_weight: float = 0.01,
-    inverse_weight: float = 1.0,
     generator: torch.Generator | None = None,
 ) -> TensorDict:
     """Return the joint loss of the VAE and its inverse model, on windows of consecutive frames.
@@ -50,12 +48,9 @@ def vae_inverse_loss(
             action t leads from frame t to t + 1 (the last one is ignored), and optionally
             ``action_known`` bool ``[*B]``, by default true: the actions of somebody else's
             demonstration are unknown.
-        reconstruction_weight: Weight of ``reconstruction``.
-        foreground_weight: Further weight, in ``loss_reconstruction``, of a pixel's error, times its
-            largest difference to ``vae.mean_frame``, so that small objects count beside what varies
-            little everywhere.
-        kl_weight: Weight of ``kl``.
-        inverse_weight: Weight of ``inverse``.
+        config: Weights of the terms. In ``loss_reconstruction``, the further weight of a pixel's
+            error is times its largest difference to ``vae.mean_frame``, so that small objects count
+            beside what varies little everywhere.
         generator: Source of the sampling noise; None: torch's default generator.
 
     Returns:
@@ -69,7 +64,7 @@ def vae_inverse_loss(
     Examples:
         >>> frames = torch.zeros(3, 4, 32, 64, 3, dtype=torch.uint8)
         >>> windows = TensorDict({"pixels": frames, "action": torch.zeros(3, 4, 4)}, [3, 4])
-        >>> loss = vae_inverse_loss(VAE(), windows, generator=torch.Generator().manual_seed(0))
+        >>> loss = vae_inverse_loss(VAE(), windows, VAEConfig())
         >>> sorted(key for key in loss.keys() if key.startswith("loss_"))
         ['loss_inverse', 'loss_kl', 'loss_reconstruction']
     """
@@ -94,13 +89,13 @@ def vae_inverse_loss(
         known = torch.ones(pixels.shape[:-4], dtype=torch.bool, device=pixels.device)
     squared = (predicted - action[..., :-1, :]).square().sum(-1).mean(-1)
     difference = (frames - vae.mean_frame).abs().amax(-1, keepdim=True)
-    counted = error * (1 + foreground_weight * difference)
+    counted = error * (1 + config.foreground_weight * difference)
     kl = (mu.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean() / 2
     inverse = (squared * known).sum() / known.sum().clamp_min(1) / 2
     terms = {
-        "loss_reconstruction": reconstruction_weight * counted.sum((-3, -2, -1)).mean(),
-        "loss_kl": kl_weight * kl,
-        "loss_inverse": inverse_weight * inverse,
+        "loss_reconstruction": config.reconstruction_weight * counted.sum((-3, -2, -1)).mean(),
+        "loss_kl": config.kl_weight * kl,
+        "loss_inverse": config.inverse_weight * inverse,
         "reconstruction": error.detach().sum((-3, -2, -1)).mean(),
         "kl": kl.detach(),
         "inverse": inverse.detach(),

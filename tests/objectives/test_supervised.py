@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from bgpo_trl.configs import VAEConfig
 from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.objectives.supervised import (
@@ -52,9 +53,9 @@ def test_hand_computed_numbers() -> None:
     result = vae_inverse_loss(
         HandVAE(mu, log_variance, grey=0.3),  # type: ignore[arg-type]
         data,
-        reconstruction_weight=2.0,
-        kl_weight=0.5,
-        inverse_weight=3.0,
+        VAEConfig(
+            reconstruction_weight=2.0, foreground_weight=0.0, kl_weight=0.5, inverse_weight=3.0
+        ),
     )
     # Transitions [0, 2] against [0, 1], and [2, 0] against [2, 1]; the last action is not read.
     assert result["inverse"].item() == pytest.approx(0.5)
@@ -73,7 +74,7 @@ def test_pixels_that_differ_from_the_mean_frame_weigh_more() -> None:
     vae.mean_frame = torch.full((32, 64, 3), 0.2)
     vae.mean_frame[3, 5] = torch.tensor([0.2, 0.5, 0.1])
     vae.mean_frame[8, 9] = 0.25
-    result = vae_inverse_loss(vae, data, foreground_weight=7.0)  # type: ignore[arg-type]
+    result = vae_inverse_loss(vae, data, VAEConfig(foreground_weight=7.0))  # type: ignore[arg-type]
     assert result["reconstruction"].item() == pytest.approx(6144 * 0.1**2, rel=1e-4)
     counted = (6144 + 7 * 3 * (0.3 + 0.05)) * 0.1**2
     assert result["loss_reconstruction"].item() == pytest.approx(counted, rel=1e-4)
@@ -86,7 +87,7 @@ def test_latents_are_sampled_with_the_posteriors_standard_deviation() -> None:
     vae = HandVAE(mu, log_variance)
     data = windows(4, 3, 1000)
     data["action"].zero_()
-    loss = vae_inverse_loss(vae, data, generator=generator)  # type: ignore[arg-type]
+    loss = vae_inverse_loss(vae, data, VAEConfig(), generator=generator)  # type: ignore[arg-type]
     assert loss["inverse"].item() == pytest.approx(1000 * 0.3**2, rel=0.05)
 
 
@@ -97,9 +98,10 @@ def test_only_known_actions_train_the_inverse_model() -> None:
     known = torch.tensor([True, False, True])
     data = TensorDict({**windows(3), "action_known": known}, [3])
     expected = data["action"][[0, 2], :2].square().sum(-1).mean() / 2
-    assert vae_inverse_loss(vae, data)["inverse"] == pytest.approx(expected.item())  # type: ignore[arg-type]
+    loss = vae_inverse_loss(vae, data, VAEConfig())  # type: ignore[arg-type]
+    assert loss["inverse"] == pytest.approx(expected.item())
     data["action_known"][:] = False
-    assert vae_inverse_loss(vae, data)["inverse"] == 0  # type: ignore[arg-type]
+    assert vae_inverse_loss(vae, data, VAEConfig())["inverse"] == 0  # type: ignore[arg-type]
 
 
 def test_action_inference_loss_is_the_squared_error() -> None:
