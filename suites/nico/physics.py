@@ -54,18 +54,15 @@ class Physics(dm_mujoco.Physics):
             for kind, count in counts.items()
         }
 
-    def _id(self, kind: str, name: str) -> int:
-        return self._ids[kind][name]
-
     def _object_id(self, kind: str, name: str) -> int:
         if name not in OBJECTS:
             raise ValueError(f"no object {name!r} in the scene; choose one of {', '.join(OBJECTS)}")
-        return self._id(kind, name)
+        return self._ids[kind][name]
 
     @cached_property
     def _hand(self) -> list[int]:
         # One pass suffices, since each body comes after its parent.
-        bodies = {self._id("body", HAND)}
+        bodies = {self._ids["body"][HAND]}
         for body, parent in enumerate(self.model.body_parentid):
             if parent in bodies:
                 bodies.add(body)
@@ -77,7 +74,7 @@ class Physics(dm_mujoco.Physics):
         if name not in self._ids["geom"]:
             names = ", ".join([HAND, *self._ids["geom"]])
             raise ValueError(f"no {name!r} in the scene; choose one of {names}")
-        return [self._id("geom", name)]
+        return [self._ids["geom"][name]]
 
     @cached_property
     def actuated_limits(self) -> tuple[np.ndarray, np.ndarray]:
@@ -103,11 +100,11 @@ class Physics(dm_mujoco.Physics):
 
     def grip_position(self) -> np.ndarray:
         """Return the center of the grip, where a held glass would be (m), ``[3]``."""
-        return self.data.site_xpos[self._id("site", "grip")].copy()
+        return self.data.site_xpos[self._ids["site"]["grip"]].copy()
 
     def palm_position(self) -> np.ndarray:
         """Return the centre of the palm (m), ``[3]``."""
-        return self.data.site_xpos[self._id("site", "palm")].copy()
+        return self.data.site_xpos[self._ids["site"]["palm"]].copy()
 
     def object_position(self, name: str) -> np.ndarray:
         """Return the center of an object (m), ``[3]``."""
@@ -191,7 +188,7 @@ class Physics(dm_mujoco.Physics):
     def robot_touches(self) -> bool:
         """Return whether any part of the robot touches the table or an object."""
         bodies = self.model.body_rootid[self.model.geom_bodyid]
-        robot = self._id("body", "torso")
+        robot = self._ids["body"]["torso"]
         geoms = self.data.contact.geom
         return bool((bodies[geoms] == robot).any())
 
