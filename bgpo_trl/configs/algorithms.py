@@ -338,8 +338,9 @@ class FineTuningConfig(BGPOConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("experts", "group_balanced_replay"):
-            check(self, (name, not getattr(self, name), "off, as in fine-tuning"))
+        # Experts need it, too.
+        off = not self.group_balanced_replay
+        check(self, ("group_balanced_replay", off, "off, as in fine-tuning"))
 
 
 @dataclass(frozen=True)

@@ -88,9 +88,14 @@ def test_the_same_command_records_and_trains_nothing_again(made, folder, monkeyp
 
     for name in ("demonstrate", "play"):
         monkeypatch.setattr(f"bgpo_trl.data.recording._Recorder.{name}", refuse)
+    left = []  # steps of each encoder; probes measure again
+    monkeypatch.setattr(
+        "bgpo_trl.encoders.fitting.progress_bar", lambda _, steps, **k: left.extend(steps) or steps
+    )
     play = load_demonstrations(folder / "demonstrations-play")
     assert (len(play), int((~play["train"]).sum())) == (6, 3)
     encoders, bank = make()
+    assert not left
     assert encoders.identity == made[0].identity
     assert bank.embedding.equal(made[1].embedding)
     with pytest.raises(ValueError, match="holds another recording"):
