@@ -192,7 +192,7 @@ def final_means(run: Run, kind: str, column: str) -> Values | None:
     if np.isnan(run.by_seed_and_task(found.size())).any():
         raise ValueError(
             f"{run.directory / 'final.csv'} lacks tests with {kind} demonstrations: remove it and "
-            "summary.json, and resume the run"
+            "resume the run"
         )
     values = run.by_seed_and_task(found[column].mean())
     return None if np.isnan(values).all() else values

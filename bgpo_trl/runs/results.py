@@ -291,13 +291,15 @@ def read_run(directory: str | os.PathLike[str]) -> Run:
 
 
 def is_finished(directory: Path, episodes: int) -> bool:
-    """Return whether a run of so many episodes came to its end, of which its summary is the mark.
+    """Return whether a run of so many episodes was tested at its end and has their summary.
 
     Raises:
         ValueError: If the summary is damaged.
     """
     path = directory / "summary.json"
-    return path.exists() and read_json(path).get("episodes") == episodes
+    if not (path.exists() and (directory / "final.csv").exists()):
+        return False
+    return read_json(path).get("episodes") == episodes
 
 
 def joined(runs: Iterable[Run]) -> list[Run]:

@@ -32,9 +32,11 @@ def folder():
 
 @pytest.fixture(scope="module")
 def ray(folder):
-    """Ray as sweeps start it."""
+    """Ray as sweeps start it; other tests of this process ask who handles SIGTERM."""
+    before = signal.getsignal(signal.SIGTERM)
     with jobs.connected("local", 1, 0):
         yield
+    signal.signal(signal.SIGTERM, before)
 
 
 def make_jobs(folder, names, episodes=6):
@@ -69,6 +71,7 @@ def make_play():
             except KeyboardInterrupt:
                 (job.directory / "saved").touch()
                 raise
+        (job.directory / "final.csv").touch()
         (job.directory / "summary.json").write_text(f'{{"episodes": {job.config.episodes}}}')
 
     return play
@@ -119,6 +122,7 @@ def test_a_job_waits_for_the_lock_and_skips_a_finished_run(make_config, tmp_path
     thread.start()
     thread.join(0.3)
     assert thread.is_alive()
+    (job.directory / "final.csv").touch()
     summary = job.directory / "summary.json"
     summary.write_text(f'{{"episodes": {job.config.episodes}}}')
     other.communicate("\n")

@@ -32,6 +32,7 @@ def write_run(job):
     job.directory.mkdir(parents=True, exist_ok=True)
     settings = settings_of(job.config, Digests("some", "bank"))
     (job.directory / "config.json").write_text(json.dumps(settings))
+    (job.directory / "final.csv").touch()
     (job.directory / "summary.json").write_text(f'{{"episodes": {job.config.episodes}}}')
 
 
