@@ -291,14 +291,16 @@ class Algorithm(ABC):
         """Return actions of a training step ``[S, A]``, and choose who plays episodes that begin.
 
         Args:
-            tensordict: Inputs of the policies and ``"step_count"``, ``[S]``.
+            tensordict: Inputs of the policies, ``"step_count"`` and, with groups,
+                ``"group_fits"``, ``[S]``.
             groups: Group or task of each seed's episode.
             expert: Place of its networks, int64 ``[S]``.
         """
         only_clone = None
         if self.proposals is not None:
+            fits = tensordict.get("group_fits", torch.ones(len(groups), dtype=torch.bool))
             for seed in (tensordict["step_count"].flatten() == 0).nonzero().flatten().tolist():
-                self.proposals.begin(seed, groups[seed])
+                self.proposals.begin(seed, groups[seed], trial=not fits[seed])
             only_clone = torch.tensor(self.proposals.only_clone)
         seen = self.to_device(tensordict.select(*self.learner.policy.in_keys))
         return self.learner.act(seen, self._noise, expert, only_clone)

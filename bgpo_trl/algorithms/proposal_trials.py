@@ -26,8 +26,9 @@ class ProposalTrials:
 
     1. the clone alone plays the first ``clone_episodes`` training episodes of a group, then every
        second one while it is better than the critics' choice (2), and otherwise one in
-       ``1 / clone_share``; the critics choose in all others, since they learn only from what they
-       have chosen;
+       ``1 / clone_share``; while it is better, it also plays all trials of experts (`GroupLookup`),
+       which are to tell whether two groups are one task, and would not by a policy that fails; the
+       critics choose in all others, since they learn only from what they have chosen;
     2. outside training, the critics choose if what they chose has succeeded at least as often as
        the clone alone, in the latest training episodes of each, about 33. Else, and before 20
        episodes of theirs, the clone acts.
@@ -60,13 +61,13 @@ class ProposalTrials:
         """Whether the clone plays the present episode of each seed."""
         return [alone for _, alone in self._playing]
 
-    def begin(self, seed: int, group: int) -> bool:
+    def begin(self, seed: int, group: int, *, trial: bool = False) -> bool:
         """Return whether the clone alone plays the training episode that begins."""
         record = self._groups[seed].setdefault(group, _Record())
-        alone = record.episodes < self.clone_episodes
+        better = self.clone_is_better(seed, group)
+        alone = record.episodes < self.clone_episodes or (trial and better)
         if not alone:
-            half = self.clone_is_better(seed, group)
-            record.due += max(0.5, self.clone_share) if half else self.clone_share
+            record.due += max(0.5, self.clone_share) if better else self.clone_share
             alone = record.due > 1 - 1e-6
             record.due -= alone
         self._playing[seed] = group, alone

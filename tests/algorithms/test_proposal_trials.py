@@ -69,6 +69,16 @@ def test_the_rules_by_hand():
     assert play(trials, [True] * 11) == [False, True] + [False, False, False, True] * 2 + [False]
 
 
+def test_the_clone_plays_trials_as_long_as_it_is_better():
+    trials = ProposalTrials(1, clone_episodes=2, clone_share=0.5)
+    play(trials, [True] * 2)
+    assert all(trials.begin(0, 7, trial=True) for _ in range(5))
+    assert play(trials, [True] * 3) == [False, True, False]  # trials are not set off against it
+    play(trials, [True] * 36)
+    assert not trials.clone_is_better(0, 7)
+    assert [trials.begin(0, 7, trial=True) for _ in range(3)] == [True, False, True]
+
+
 def test_episodes_of_demonstrations_that_belong_to_another_group_do_not_count():
     """A new task's first episodes are played by an old group, and fail; then it has its own."""
     trials = ProposalTrials(1, clone_episodes=0, clone_share=0.5)
