@@ -1,5 +1,6 @@
 """BGPO with groups of behaviors: experts, balanced replay, and demonstrations as experience."""
 
+import itertools
 from dataclasses import replace
 
 import pytest
@@ -81,6 +82,27 @@ def test_who_plays_is_decided_at_reset_and_acts_until_the_end(make_bgpo, bank):
     entries, group = algorithm.replay.contents(0)
     shown = bank.seen().embedding[entries["demo_index"]]
     assert group.equal(algorithm.groups[0].lookup(shown).group)
+
+
+def test_trials_of_experts_are_played_as_such(make_bgpo):
+    algorithm = make_bgpo("all", schedule=TaskSchedule((0, 0, 0)), known=15)
+    begin, told = algorithm.proposals.begin, []
+
+    def watched(seed, group, *, trial):
+        told.append((seed, group, trial))
+        return begin(seed, group, trial=trial)
+
+    algorithm.proposals.begin = watched
+    for groups in algorithm.groups:
+        fits = itertools.cycle([True, False])
+        groups.expert = lambda _, group, fits=fits: (group, next(fits))
+    data, _ = play(algorithm, 30)
+    starts = (data["step_count"] == 0).squeeze(-1).T.nonzero().tolist()
+    begun = [data[seed, step] for step, seed in starts]
+    seeds = [seed for _, seed in starts]
+    expected = [(int(at["expert"]), not at["group_fits"]) for at in begun]
+    assert told == [(seed, *of) for seed, of in zip(seeds, expected, strict=True)]
+    assert {trial for _, _, trial in told} == {True, False}
 
 
 @pytest.mark.parametrize("variant", ["group-balanced replay", "all"])
