@@ -22,7 +22,7 @@ from torchrl.envs import Compose
 
 from bgpo_trl.algorithms import Algorithm, entry
 from bgpo_trl.algorithms.algorithm import Policy
-from bgpo_trl.algorithms.environments import bound, encode
+from bgpo_trl.algorithms.observation import bound, encode
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.dataset import resize_frames

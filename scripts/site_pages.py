@@ -36,7 +36,7 @@ REFERENCE = {
         "objectives.maml",
         "objectives.supervised",
     ],
-    "algorithms": ["algorithms.algorithm", "algorithms.environments", "algorithms.bgpo"],
+    "algorithms": ["algorithms.algorithm", "algorithms.observation", "algorithms.bgpo"],
     "training": ["training", "configs.runs", "configs.algorithms"],
     "scenes": ["scenes.scene", "scenes.simulation"],
     "data": ["data.recording", "data.dataset", "data.bank"],

@@ -33,7 +33,7 @@ from torch import Tensor
 from torch.func import functional_call
 from torchrl.envs import Compose, StepCounter, TransformedEnv
 
-from bgpo_trl.algorithms.environments import bound, encode
+from bgpo_trl.algorithms.observation import bound, encode
 from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
 from bgpo_trl.configs import SHOWN, BGPOConfig, RLConfig
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.func import functional_call
 from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, Transform, TransformedEnv
 
-from bgpo_trl.algorithms.environments import bound, encode
+from bgpo_trl.algorithms.observation import bound, encode
 from bgpo_trl.algorithms.proposal_trials import ProposalTrials
 from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import AlgorithmConfig
@@ -298,9 +298,10 @@ class Algorithm(ABC):
         """
         only_clone = None
         if self.proposals is not None:
-            fits = tensordict.get("group_fits", torch.ones(len(groups), dtype=torch.bool))
+            fits = tensordict.get("group_fits", None)
             for seed in (tensordict["step_count"].flatten() == 0).nonzero().flatten().tolist():
-                self.proposals.begin(seed, groups[seed], trial=not fits[seed])
+                trial = fits is not None and not fits[seed]
+                self.proposals.begin(seed, groups[seed], trial=trial)
             only_clone = torch.tensor(self.proposals.only_clone)
         seen = self.to_device(tensordict.select(*self.learner.policy.in_keys))
         return self.learner.act(seen, self._noise, expert, only_clone)

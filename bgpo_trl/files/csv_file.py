@@ -65,6 +65,12 @@ class CsvFile:
             ValueError: If the file has no such column.
             OSError: If the row cannot be written; the file then ends with the previous row.
         """
+        unknown = [name for name in row if name not in self.columns]
+        if unknown:
+            raise ValueError(
+                f"{self.path.name} has no column {', '.join(unknown)}: name it when the run is "
+                f"created, or write only {', '.join(self.columns)}."
+            )
         self._append(self._line({name: plain_value(value) for name, value in row.items()}))
 
     def position(self) -> int:

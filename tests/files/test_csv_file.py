@@ -25,7 +25,7 @@ def test_rows_are_written_at_once_and_continued_after_reopening(tmp_path):
     # Reopened without a close, as after a kill.
     second = CsvFile(path, COLUMNS)
     second.write({"episode": 2, "task": 'push "green", slowly', "return": 1})
-    with pytest.raises(ValueError, match="loss"):
+    with pytest.raises(ValueError, match="has no column loss"):
         second.write({"episode": 3, "loss": 0.5})
     assert path.read_bytes() == HEAD + b'1,,0.1\n2,"push ""green"", slowly",1\n'
 

@@ -1,4 +1,4 @@
-"""What policies observe of the robot: transforms of frames, ground truth and joints."""
+"""Transforms turn frames, ground truth and joints into what policies observe."""
 
 from __future__ import annotations
 
