@@ -15,7 +15,7 @@ from torchrl.envs import Compose, TransformedEnv
 
 from bgpo_trl.algorithms import Algorithm
 from bgpo_trl.algorithms.algorithm import Policy
-from bgpo_trl.algorithms.observation import bound, encode
+from bgpo_trl.algorithms.observation import bound, encode, observed_size
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.representation import Representation
@@ -76,7 +76,7 @@ class Evaluator:
         scene: Robot to test; that of the run by default.
 
     Raises:
-        ValueError: If a task has no demonstration.
+        ValueError: If a task has no demonstration, or policies cannot observe the scene.
     """
 
     def __init__(
@@ -91,6 +91,7 @@ class Evaluator:
     ) -> None:
         scene = find_scene(config.scene if scene is None else scene)
         self.config, learner, n_tasks = config, config.algorithm, len(config.tasks)
+        observed_size(learner, scene, encoders)
         self.schedule = TaskSchedule((0,) * n_tasks if starts is None else starts)
         self.shape = (len(config.seeds), n_tasks, episodes)
         self._rows_of = [torch.nonzero(bank.task == task).flatten() for task in range(n_tasks)]

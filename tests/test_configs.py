@@ -65,7 +65,8 @@ BAD = {
         "beta": NAN,
         "demonstration_share": 0.999,
     },
-    FineTuningConfig: {"group_balanced_replay": True},  # of which nothing is forgotten
+    # Of a balanced replay, nothing is forgotten.
+    FineTuningConfig: {"experts": True, "group_balanced_replay": True},
     MAMLConfig: {"inner_learning_rate": NAN, "task_batch_size": 7, "demonstration_share": 0.999},
     DistNLLConfig: {
         "learning_rate": NAN,

@@ -28,10 +28,13 @@ from torch import Tensor
 from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.analysis.task_inference import group_counts, majority_task
 from bgpo_trl.configs import BGPOConfig
+from bgpo_trl.configs.runs import check_seeds
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.recording import new_demonstrations
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import encode_frames
+from bgpo_trl.experiments.command_line import command_line
+from bgpo_trl.experiments.settings import chosen_tasks
 from bgpo_trl.files.writing import make_folder
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
@@ -58,6 +61,13 @@ class Arguments:
     """Seeds of the networks."""
     recording_seed: int = 1
     """Seed of the new demonstrations; those of the shipped banks have 0."""
+
+    def __post_init__(self) -> None:
+        check_seeds(self.seeds)
+        if min(self.draws, self.per_task) < 1:
+            raise ValueError("--draws and --per-task must be at least 1")
+        if not self.shares or min(self.shares) <= 0 or max(self.shares) > 1:
+            raise ValueError("--shares must be above 0 and at most 1")
 
 
 @dataclass(frozen=True)
@@ -154,9 +164,11 @@ def unknown_task(
 def study(arguments: Arguments) -> str:
     """Measure both; write the files and return the tables."""
     torch.set_num_threads(1)
-    out, seeds = make_folder(arguments.out), arguments.seeds
-    tasks = NICO.all_tasks if arguments.tasks == ("all",) else arguments.tasks
+    seeds, tasks = arguments.seeds, chosen_tasks(arguments.tasks, NICO)
+    if len(tasks) < 2:
+        raise ValueError("--tasks: name at least two, of which each is left out in turn")
     encoders, bank = load_pretrained(tasks=tasks)
+    out = make_folder(arguments.out)
     seen = bank.for_tasks(tasks).seen()
     new = new_demonstrations(
         tasks=tasks, per_task=arguments.per_task, seed=arguments.recording_seed
@@ -197,4 +209,4 @@ def _table(rows: pd.DataFrame, by: str) -> str:
 
 
 if __name__ == "__main__":
-    print(study(tyro.cli(Arguments)))
+    command_line(study)

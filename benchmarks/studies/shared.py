@@ -30,11 +30,7 @@ Actor = Callable[[TimeStep], NDArray]
 
 @dataclass(frozen=True, kw_only=True)
 class TrainedArguments(ImportArguments):
-    """Tests of the policies of a run.
-
-    Raises:
-        ValueError: If ``episodes`` is less than 1.
-    """
+    """Tests of the policies of a run."""
 
     run: tyro.conf.Positional[Path]
     """Run directory."""

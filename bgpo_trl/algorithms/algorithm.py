@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.func import functional_call
 from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, Transform, TransformedEnv
 
-from bgpo_trl.algorithms.observation import bound, encode
+from bgpo_trl.algorithms.observation import bound, encode, observed_size
 from bgpo_trl.algorithms.proposal_trials import ProposalTrials
 from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import AlgorithmConfig
@@ -151,25 +151,8 @@ class Algorithm(ABC):
         self.bank, self.encoders = bank, encoders
         if encoders is not None:
             encoders.frame_network.to(self.device)
-        if config.state == "state":
-            if self.scene.state is None:
-                raise ValueError(
-                    f"the scene {self.scene.name!r} has no ground truth: learn from frames, with "
-                    "state='latent'"
-                )
-            self.state_size = self.scene.state.size
-        elif encoders is None:
-            raise ValueError("state='latent' needs trained encoders")
-        else:
-            self.state_size = encoders.frame_network.latent_size
+        self.state_size = observed_size(config, self.scene, encoders)
         self.joints = self.scene.joints if config.joints else None
-        if self.joints is not None:
-            self.state_size += self.joints.size
-        elif config.joints:
-            raise ValueError(
-                f"the scene {self.scene.name!r} has no joints for policies to read: set joints to "
-                "False, or give it Scene.joints and its simulation joints() (docs/extending.md)"
-            )
         if bank.steps is not None and bank.steps.action.shape[-1] != self.scene.action_size:
             raise ValueError(
                 f"actions of the demonstrations have {bank.steps.action.shape[-1]} components, "

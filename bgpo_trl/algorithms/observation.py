@@ -7,8 +7,36 @@ from torchrl.envs import CatTensors, ClipTransform, ObservationNorm, Transform
 
 from bgpo_trl.configs import AlgorithmConfig
 from bgpo_trl.encoders.representation import Representation
-from bgpo_trl.scenes import StateColumns
+from bgpo_trl.scenes import Scene, StateColumns
 from bgpo_trl.transforms import FrameEncoder
+
+
+def observed_size(config: AlgorithmConfig, scene: Scene, encoders: Representation | None) -> int:
+    """Return the number of features that policies observe in a scene.
+
+    Raises:
+        ValueError: If the scene lacks the ground truth or the joints that they are to read, or
+            there are no encoders for latents.
+    """
+    if config.state == "state":
+        if scene.state is None:
+            raise ValueError(
+                f"the scene {scene.name!r} has no ground truth: learn from frames, with "
+                "state='latent'"
+            )
+        size = scene.state.size
+    elif encoders is None:
+        raise ValueError("state='latent' needs trained encoders")
+    else:
+        size = encoders.frame_network.latent_size
+    if not config.joints:
+        return size
+    if scene.joints is None:
+        raise ValueError(
+            f"the scene {scene.name!r} has no joints for policies to read: set joints to "
+            "False, or give it Scene.joints and its simulation joints() (docs/extending.md)"
+        )
+    return size + scene.joints.size
 
 
 def encode(

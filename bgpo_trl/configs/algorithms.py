@@ -92,7 +92,7 @@ class RLConfig(Settings):
     choose."""
     clone_share: float = 0.25
     """With both proposals, share of later training episodes that the clone plays alone, so that
-    what it achieves is known; at least a half while it is the better one (`ProposalTrials`)."""
+    what it achieves is known; more while it is the better one (`ProposalTrials`)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -337,10 +337,10 @@ class FineTuningConfig(BGPOConfig):
     """See `AlgorithmConfig`."""
 
     def __post_init__(self) -> None:
+        # First, since experts need a replay that is balanced.
+        for name in ("experts", "group_balanced_replay"):
+            check(self, (name, not getattr(self, name), "off, as in fine-tuning"))
         super().__post_init__()
-        # Experts need it, too.
-        off = not self.group_balanced_replay
-        check(self, ("group_balanced_replay", off, "off, as in fine-tuning"))
 
 
 @dataclass(frozen=True)

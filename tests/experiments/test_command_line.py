@@ -86,6 +86,8 @@ CASES = [
     # measurements
     ("studies/aftermath.py --demonstrators --episodes 0", "--episodes"),
     ("bgpo groups --draws 0", "--draws"),
+    ("studies/cut_demonstrations.py new --draws 0", "--draws"),
+    ("studies/cut_demonstrations.py new --tasks grasp_glass", "--tasks: name at least two"),
     ("bgpo groups --seeds 0 0", "seeds"),
     ("studies/tasks.py --starts 1", "--starts"),
     ("studies/tasks.py --pictures no-such-folder", "no-such-folder"),

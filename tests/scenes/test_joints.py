@@ -15,6 +15,7 @@ from bgpo_trl.data.lerobot import read_lerobot
 from bgpo_trl.data.lerobot_export import write_lerobot
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.train import make_bank, train_encoders
+from bgpo_trl.evaluation import Evaluator
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.policy import load_run
 from bgpo_trl.scenes import SCENES, StateColumns
@@ -176,6 +177,9 @@ def test_what_lacks_joints_is_refused_in_a_line(made, monkeypatch, tmp_path, ref
     refused(lambda: begin((encoders, other)), "has 3 joints", "make the bank again")
     monkeypatch.setitem(SCENES, "dot", scene(SavedDot))
     refused(lambda: begin((encoders, bank)), "has no joints for policies", "set joints to False")
+    test = partial(Evaluator, run_config(algorithm=JOINED), bank.held_out(), episodes=1)
+    refused(lambda: test(encoders), "has no joints for policies", "set joints to False")
+    refused(lambda: test(None), "state='latent'", "needs trained encoders")
     frames = np.zeros((3, 16, 24, 3), np.uint8)
     written = {"pixels": frames, "joints": np.zeros((3, 2))}
     options = {"held_out_per_task": 0, "scene": scene()}
