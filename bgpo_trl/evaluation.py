@@ -91,7 +91,7 @@ class Evaluator:
     ) -> None:
         scene = find_scene(config.scene if scene is None else scene)
         self.config, learner, n_tasks = config, config.algorithm, len(config.tasks)
-        observed_size(learner, scene, encoders)
+        observed_size(learner, scene, encoders)  # refuses a scene that policies cannot observe
         self.schedule = TaskSchedule((0,) * n_tasks if starts is None else starts)
         self.shape = (len(config.seeds), n_tasks, episodes)
         self._rows_of = [torch.nonzero(bank.task == task).flatten() for task in range(n_tasks)]
