@@ -224,7 +224,9 @@ class Trial:
         success, steps = torch.zeros_like(active), torch.zeros(n_tests)
         while active.any():
             alone_in_all = torch.full([n_tests], alone)
-            state["action"] = self.act(state["latent"], alone_in_all, averaged=True)
+            # Averages begin with the first update, after the imitation.
+            averaged = self.n_updates > 0
+            state["action"] = self.act(state["latent"], alone_in_all, averaged=averaged)
             state = env.step(state.set("_step", active))["next"]
             steps += active
             success |= state["success"].flatten() & active
