@@ -222,10 +222,9 @@ class Trial:
         env = self.env(n_tests, stream_seed(self.arguments.seed, "evaluation"))
         state, active = env.reset(), torch.ones(n_tests, dtype=torch.bool)
         success, steps = torch.zeros_like(active), torch.zeros(n_tests)
+        alone_in_all = torch.full([n_tests], alone)
+        averaged = self.n_updates > 0  # Averages begin with the first update, after the imitation.
         while active.any():
-            alone_in_all = torch.full([n_tests], alone)
-            # Averages begin with the first update, after the imitation.
-            averaged = self.n_updates > 0
             state["action"] = self.act(state["latent"], alone_in_all, averaged=averaged)
             state = env.step(state.set("_step", active))["next"]
             steps += active

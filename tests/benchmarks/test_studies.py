@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 from torch.func import functional_call
 
-from benchmarks.studies import trained
+from benchmarks.studies import one_task, trained
 from benchmarks.studies.cut_demonstrations import Networks, unknown_task
 from benchmarks.studies.gwr_as_published import Arguments, grow
 from benchmarks.studies.trained import POLICIES, Row, summarized
@@ -51,6 +51,24 @@ def test_an_unknown_task_is_told_by_its_novelty(bank):
     assert found["detected"].tolist() == [1, 1]
     same = unknown_task(networks, known.seen().embedding, known.seen().embedding, (3, 8))
     assert same["area"].tolist() == [0.5, 0.5]
+
+
+def test_before_training_a_clone_is_tested_by_what_it_has_imitated(monkeypatch):
+    monkeypatch.setattr(one_task, "N_IMITATION", 3)
+    trial = one_task.Trial(one_task.Arguments(demonstrations=5, tests=1))
+    trial.imitate()
+    act, acted = trial.act, []
+
+    def noted(latent, *arguments, **options):
+        acted.append((latent.clone(), act(latent, *arguments, **options)))
+        return acted[-1][1]
+
+    monkeypatch.setattr(trial, "act", noted)
+    trial.report(0, alone=True)
+    latent, action = acted[0]
+    state = TensorDict({"latent": latent[None, None]}, [1, 1, 1])
+    imitated = trial.learner.loss.call_network("clone_network", state)["action"]
+    torch.testing.assert_close(action, imitated[0, 0])
 
 
 def test_a_policy_of_proposals_is_taken_apart():
