@@ -35,7 +35,7 @@ DISTINCT = (
     "oracle-demonstrations",
     "ddpg",
     "fine-tuning-demonstrations",
-    "ewc",
+    "ewc-demonstrations",
 )
 """An algorithm of each kind: others differ in values of settings, or in less to store and learn."""
 

@@ -80,6 +80,7 @@ ALGORITHMS: dict[str, Entry] = {
     "fine-tuning": Entry(FineTuning, FineTuningConfig()),
     "fine-tuning-demonstrations": Entry(FineTuning, FineTuningConfig(**_SHOWN)),
     "ewc": Entry(EWC, EWCConfig()),
+    "ewc-demonstrations": Entry(EWC, EWCConfig(**_SHOWN)),
     "without-bonus": Entry(BGPO, replace(_SINGLE, beta=0.0)),
     "without-gwr": Entry(BGPO, replace(_SINGLE, context="embedding")),
     "without-both": Entry(BGPO, replace(_SINGLE, context="embedding", beta=0.0)),

@@ -74,12 +74,12 @@ _CHUNK = 64  # samples whose gradients are held at once
 class EWC(FineTuning):
     """Fine-tuning with elastic weight consolidation (EWC; Kirkpatrick et al., 2017).
 
-    When a task begins, it estimates how much the seed's policy depends on each weight of its actor
-    (`diagonal_fisher`), from transitions of the task that ends, and adds this to the estimates of
-    earlier boundaries. From then on, `EWCLearner` keeps the actor near its present weights. This
-    is the online form (Schwarz et al., 2018), with one penalty for all earlier tasks; estimates do
-    not decay. As by default in Continual World (Wolczyk et al., 2021), the critic is free to
-    change and the replay is emptied.
+    When a task begins, it estimates how much the actions of the seed depend on each weight of its
+    actor and, with demonstrations, of its clone (`diagonal_fisher`), from transitions of the task
+    that ends, and adds this to the estimates of earlier boundaries. From then on, `EWCLearner`
+    keeps both near their present weights. This is the online form (Schwarz et al., 2018), with one
+    penalty for all earlier tasks; estimates do not decay. As by default in Continual World (Wolczyk
+    et al., 2021), critics are free to change and the replay is emptied.
 
     Arguments as for `BGPO`.
     """
@@ -92,7 +92,7 @@ class EWC(FineTuning):
         return EWCLearner(super().make_learner(spec), weight=self.config.ewc_weight)
 
     def begin_task(self, index: int, task: int) -> None:
-        """Consolidate the policy of the seed in the task that ends, and empty its replay.
+        """Consolidate the policies of the seed in the task that ends, and empty its replay.
 
         If the replay is empty already, since several tasks begin at once, nothing changes.
         """
@@ -105,18 +105,19 @@ class EWC(FineTuning):
 
 
 class EWCLearner(Learner):
-    """DDPG learner with the penalty of EWC on its actor (Kirkpatrick et al., 2017, Eq. 3).
+    """DDPG learner with the penalty of EWC on actor and clone (Kirkpatrick et al., 2017, Eq. 3).
 
-    For each seed, it is ``weight / 2`` times the sum over the actor's weights of the Fisher
-    information times the squared distance from the anchor, the weights at the latest boundary. It
-    is 0 before the first one.
+    For each seed, it is ``weight / 2`` times the sum over the weights of actor and clone of the
+    Fisher information times the squared distance from the anchor, the weights at the latest
+    boundary. It is 0 before the first one.
 
     Args:
         learner: Learner without the penalty, whose networks it trains.
         weight: Weight lambda of the penalty.
 
     Attributes:
-        anchor: The actors' weights at the latest boundary of each seed, by name, ``[S, E, ...]``.
+        anchor: Weights of actors and clones at the latest boundary of each seed, by name in
+            ``loss``, ``[S, E, ...]``.
         fisher: Diagonal of the Fisher information, summed over boundaries, in the same form.
     """
 
@@ -131,7 +132,7 @@ class EWCLearner(Learner):
         return {**super().losses(batch), "loss_ewc": self.penalty()}
 
     def penalty(self) -> Tensor:
-        """Return the penalty of each actor, ``[S, E]``."""
+        """Return the penalty of each expert, ``[S, E]``."""
         of_each = [
             (self.fisher[key] * (value - self.anchor[key]).square()).flatten(2).sum(-1)
             for key, value in self._weights().items()
@@ -139,20 +140,28 @@ class EWCLearner(Learner):
         return self.weight / 2 * torch.stack(of_each).sum(0)
 
     def consolidate(self, index: int, inputs: TensorDictBase) -> None:
-        """Anchor the actor of one seed where it is.
+        """Anchor actor and clone of one seed where they are.
 
         Args:
             index: Position of the seed.
-            inputs: The actor's inputs ``[N]`` in states of the task that ends.
+            inputs: Their inputs ``[N]`` in states of the task that ends.
         """
-        weights = {key: value[index, 0].detach() for key, value in self._weights().items()}
-        for key, value in diagonal_fisher(self.loss.actor_network, weights, inputs).items():
-            self.anchor[key][index, 0] = weights[key]
-            self.fisher[key][index, 0] += value
+        for policy in self._policies:
+            params = getattr(self.loss, f"{policy}_params").flatten_keys(".").items()
+            weights = {str(key): value[index, 0].detach() for key, value in params}
+            fisher = diagonal_fisher(getattr(self.loss, policy), weights, inputs)
+            for key, value in fisher.items():
+                self.anchor[f"{policy}_params.{key}"][index, 0] = weights[key]
+                self.fisher[f"{policy}_params.{key}"][index, 0] += value
+
+    @property
+    def _policies(self) -> tuple[str, ...]:
+        return ("actor_network", *(["clone_network"] if self.loss.has_clone else []))
 
     def _weights(self) -> dict[str, Tensor]:
-        params = self.loss.actor_network_params.flatten_keys(".")
-        return {str(key): value for key, value in params.items()}
+        of_policies = tuple(f"{policy}_params." for policy in self._policies)
+        named = self.loss.named_parameters()
+        return {name: value for name, value in named if name.startswith(of_policies)}
 
     def state_dict(self) -> dict[str, Any]:
         """Return the states of loss and optimizer, and what the penalty depends on."""

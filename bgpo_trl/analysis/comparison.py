@@ -25,6 +25,7 @@ NAMES = {
     "fine-tuning": "DDPG, fine-tuned",
     "fine-tuning-demonstrations": "DDPG, fine-tuned + demonstrations",
     "ewc": "DDPG with EWC",
+    "ewc-demonstrations": "DDPG with EWC + demonstrations",
     "without-bonus": "one policy, without the intrinsic reward",
     "without-gwr": "one policy, without GWR-B",
     "without-both": "one policy, without both",

@@ -61,7 +61,7 @@ class Arguments(BankArguments):
     experts too; maml and dist-nll: the baselines; bgpo-paper, maml-paper, dist-nll-paper: as
     published; oracle and ddpg: DDPG with the task label as context, and without context;
     fine-tuning and ewc: DDPG without context that is given task boundaries, best with --schedule
-    sequential; maml, dist-nll, oracle or fine-tuning followed by -demonstrations: with
+    sequential; maml, dist-nll, oracle, fine-tuning or ewc followed by -demonstrations: with
     demonstrations as experience. Ablations (Fig. 9): without-bonus, without-gwr, without-both:
     bgpo-single without the intrinsic reward, GWR-B or both; group-balanced-replay, demonstrations:
     bgpo-single with that addition. Or one that the module of --import adds."""

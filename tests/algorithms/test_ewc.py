@@ -1,5 +1,6 @@
 """Elastic weight consolidation: Fisher information and penalty against plain computations."""
 
+import pytest
 import torch
 from tensordict import TensorDict
 from torch.func import functional_call
@@ -13,13 +14,26 @@ from tests.algorithms.playing import make_batch
 N_STATE = 6
 
 
-def make(weight=1.0, seeds=(3, 8)):
+def make(weight=1.0, seeds=(3, 8), proposals="actor"):
     spec = LearnerSpec(seeds, ["state"], N_STATE, (0.0, 1.0), torch.device("cpu"))
-    return EWCLearner(make_learner(RLConfig(hidden_sizes=(16,)), spec), weight=weight)
+    config = RLConfig(hidden_sizes=(16,), critics=2, proposals=proposals)
+    return EWCLearner(make_learner(config, spec), weight=weight)
 
 
-def actor_weights(learner):
-    return dict(learner.loss.actor_network_params.flatten_keys(".").items())
+def weights_of(learner, policy):
+    """Return the weights ``[S, 1, ...]`` of actors or clones, by name in the network."""
+    return dict(getattr(learner.loss, f"{policy}_network_params").flatten_keys(".").items())
+
+
+def moved_at_random(learner, policy):
+    """Move the weights of all actors or clones; return by how much seed 1 has moved."""
+    source, moved = torch.Generator().manual_seed(4), {}
+    for key, value in weights_of(learner, policy).items():
+        step = torch.randn(value.shape, generator=source)
+        with torch.no_grad():
+            value.add_(step)
+        moved[key] = step[1, 0]
+    return moved
 
 
 def test_the_fisher_information_is_that_of_a_plain_loop():
@@ -37,26 +51,29 @@ def test_the_fisher_information_is_that_of_a_plain_loop():
     assert set(inputs.keys()) == {"latent", "context"}
 
 
-def test_the_penalty_is_that_of_equation_3_for_each_seed():
-    learner, inputs = make(weight=5.0), make_batch(30).select("state")
+@pytest.mark.parametrize(("proposals", "policies"), [("actor", 1), ("both", 2)])
+def test_the_penalty_is_that_of_equation_3_for_each_seed(proposals, policies):
+    learner, inputs = make(5.0, proposals=proposals), make_batch(30).select("state")
     assert not learner.penalty().any()
     learner.consolidate(1, inputs)
     assert not learner.penalty().any()
-    anchor = {key: value.detach().clone() for key, value in actor_weights(learner).items()}
-    fisher = diagonal_fisher(learner.policy, {k: v[1, 0] for k, v in anchor.items()}, inputs)
-    with torch.no_grad():
-        for value in actor_weights(learner).values():
-            value.add_(torch.randn(value.shape, generator=torch.Generator().manual_seed(4)))
+    expected, gradients = torch.tensor(0.0), {}
+    for policy in ("actor", "clone")[:policies]:
+        network = getattr(learner.loss, f"{policy}_network")
+        weights = {key: v[1, 0].detach() for key, v in weights_of(learner, policy).items()}
+        fisher = diagonal_fisher(network, weights, inputs)
+        moved = moved_at_random(learner, policy)
+        expected = expected + 5 / 2 * sum((fisher[key] * moved[key] ** 2).sum() for key in fisher)
+        gradients[policy] = {key: 5 * fisher[key] * moved[key] for key in fisher}
     penalty = learner.penalty()
-    moved = {k: (v.detach() - anchor[k])[1, 0] for k, v in actor_weights(learner).items()}
-    expected = 5 / 2 * sum((fisher[key] * moved[key] ** 2).sum() for key in fisher)
     torch.testing.assert_close(penalty.detach(), torch.stack([0 * expected, expected]).view(2, 1))
     learner.optimizer.zero_grad()
     penalty.sum().backward()
-    for key, value in actor_weights(learner).items():
-        assert value.grad is not None
-        torch.testing.assert_close(value.grad[1, 0], 5 * fisher[key] * moved[key])
-        assert not value.grad[0].any()
+    for policy, of_policy in gradients.items():
+        for key, value in weights_of(learner, policy).items():
+            assert value.grad is not None
+            torch.testing.assert_close(value.grad[1, 0], of_policy[key], rtol=1e-4, atol=1e-6)
+            assert not value.grad[0].any()
     assert all(p.grad is None for p in learner.loss.value_network_params.values(True, True))
 
 
@@ -67,11 +84,12 @@ def test_a_second_boundary_adds_its_information_and_moves_the_anchor():
     for seed in range(5):
         learner.learn(make_batch(2, 1, 32, seed=seed))
     assert learner.penalty()[0] > 0
-    weights = {key: value.detach().clone() for key, value in actor_weights(learner).items()}
+    weights = {key: v.detach().clone() for key, v in weights_of(learner, "actor").items()}
     learner.consolidate(0, inputs)
     assert not learner.penalty().any()
     second = diagonal_fisher(learner.policy, {k: v[0, 0] for k, v in weights.items()}, inputs)
-    for key, value in learner.fisher.items():
-        torch.testing.assert_close(value[0, 0], first[key][0, 0] + second[key])
-        assert learner.anchor[key][0].equal(weights[key][0])
-        assert not value[1].any()
+    for key, value in second.items():
+        name = f"actor_network_params.{key}"
+        torch.testing.assert_close(learner.fisher[name][0, 0], first[name][0, 0] + value)
+        assert learner.anchor[name][0].equal(weights[key][0])
+        assert not learner.fisher[name][1].any()

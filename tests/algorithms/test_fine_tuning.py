@@ -46,7 +46,7 @@ def test_until_the_first_boundary_it_is_ddpg_bit_for_bit(make):
 
 def test_only_fine_tuning_and_ewc_are_reported_to_need_boundaries(make):
     needing = {name for name in DISTINCT if make(name).needs_boundaries}
-    assert needing == {"fine-tuning-demonstrations", "ewc"}
+    assert needing == {"fine-tuning-demonstrations", "ewc-demonstrations"}
 
 
 def test_after_a_boundary_only_what_came_since_is_learned_from(make):
@@ -72,7 +72,7 @@ def test_after_a_boundary_only_what_came_since_is_learned_from(make):
     assert (learned.unsqueeze(1) == own).all(-1).any(-1).all()
 
 
-@pytest.mark.parametrize("name", ["fine-tuning-demonstrations", "ewc"])
+@pytest.mark.parametrize("name", ["fine-tuning-demonstrations", "ewc-demonstrations"])
 def test_a_seed_rests_until_its_replay_has_filled_again(make, name):
     algorithm = make(name)
     _, state = play(algorithm, 20)
