@@ -414,7 +414,7 @@ class Algorithm(ABC):
         if self.config.rl.imitates:
             imitated = self.shown.draw_actions(groups(n_rows), generator=generator)
             n_own = round(self.config.rl.success_share * n_rows)
-            if n_own and len(self.replay):
+            if n_own and n_shown < n_rows:
                 self._imitate_successes(imitated, groups(n_own), generator)
             batch |= {("imitation", key): entry for key, entry in imitated.items()}
         return TensorDict(batch, batch["priority_weight"].shape)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -23,7 +24,8 @@ class FineTuning(BGPO):
     against forgetting (Wolczyk et al., 2021, "Continual World"). It is meant for the sequential
     schedule, in which only the newest task is played. ``ddpg`` in that schedule differs in that it
     still learns from the transitions of earlier tasks. With a ``demonstration_share``, it also
-    learns from demonstrations, of those shown since the boundary.
+    learns from demonstrations, of those shown since the boundary: after it, the clone plays the
+    first episodes and the actor imitates as in a new expert of BGPO.
 
     After a boundary, a seed rests until its replay holds ``warmup_steps`` transitions again, as
     before its first update: it acts, and its actor and critic do not change.
@@ -56,7 +58,9 @@ class FineTuning(BGPO):
         self.replay.clear(index)
         if self.shown is not None:
             self.shown.clear(index)
-        self.learner.clear_momentum(index)
+        if self.proposals is not None:
+            self.proposals.follow(index, [], [])  # what it counted was of the task that ends
+        self.learner.begin_anew(index)
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that future actions, updates and snapshots depend on."""
@@ -128,14 +132,20 @@ class EWCLearner(Learner):
         self.fisher = {key: torch.zeros_like(value) for key, value in self.anchor.items()}
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Return the losses of DDPG and the penalty, ``[S, E]``."""
-        return {**super().losses(batch), "loss_ewc": self.penalty()}
+        """Return the losses of DDPG, and the penalty of the policies that learn, ``[S, E]``."""
+        losses = super().losses(batch)
+        learning = [p for p in self._policies if f"loss_{p.removesuffix('_network')}" in losses]
+        return {**losses, "loss_ewc": self.penalty(learning)} if learning else losses
 
-    def penalty(self) -> Tensor:
-        """Return the penalty of each expert, ``[S, E]``."""
+    def penalty(self, policies: Sequence[str] | None = None) -> Tensor:
+        """Return the penalty of each expert, ``[S, E]``.
+
+        Args:
+            policies: Networks of ``loss`` whose weights count; None: actor and clone.
+        """
         of_each = [
             (self.fisher[key] * (value - self.anchor[key]).square()).flatten(2).sum(-1)
-            for key, value in self._weights().items()
+            for key, value in self._weights(policies).items()
         ]
         return self.weight / 2 * torch.stack(of_each).sum(0)
 
@@ -158,8 +168,8 @@ class EWCLearner(Learner):
     def _policies(self) -> tuple[str, ...]:
         return ("actor_network", *(["clone_network"] if self.loss.has_clone else []))
 
-    def _weights(self) -> dict[str, Tensor]:
-        of_policies = tuple(f"{policy}_params." for policy in self._policies)
+    def _weights(self, policies: Sequence[str] | None = None) -> dict[str, Tensor]:
+        of_policies = tuple(f"{policy}_params." for policy in policies or self._policies)
         named = self.loss.named_parameters()
         return {name: value for name, value in named if name.startswith(of_policies)}
 

@@ -162,14 +162,17 @@ class Learner:
             return {"loss_value": self.loss.loss_value(batch)[0], **clone}
         return {str(k): v for k, v in self.loss(batch).items() if str(k).startswith("loss_")}
 
-    def clear_momentum(self, index: int) -> None:
-        """Forget the direction of the latest steps of one seed, given its position.
+    def begin_anew(self, index: int) -> None:
+        """Let the networks of one seed, given its position, begin another task.
 
-        Without gradients, its weights then stay as they are. The second moments, by which Adam
-        scales its steps, are kept.
+        The actor imitates with the full weight again, and averages begin anew with the next update.
+        The direction of the latest steps is forgotten, so that weights stay as they are without
+        gradients. The second moments, by which Adam scales its steps, are kept.
         """
         for moments in self.optimizer.state.values():
             moments["exp_avg"][index] = 0.0
+        self.loss.n_imitated[index] = 0
+        self.n_averaged[index] = 0
 
     def _stacked(self) -> dict[str, dict[str, Tensor]]:
         """Return the tensors that have a row for each expert, ``[S, E, ...]``, as in `Expert`."""

@@ -86,11 +86,52 @@ def test_a_seed_rests_until_its_replay_has_filled_again(make, name):
     assert all(not now.equal(old) for now, old in zip(copies(algorithm, 1), resting, strict=True))
 
 
-def test_ewc_without_weight_is_fine_tuning(make):
-    algorithm, plain = make("ewc", ewc_weight=0.0), make("fine-tuning")
-    ours, theirs = (play(one, 50, boundaries=BOUNDARIES)[0] for one in (algorithm, plain))
-    assert (ours == theirs).all()
+@pytest.mark.parametrize("source", ["", "-demonstrations"])
+def test_ewc_is_fine_tuning_until_a_boundary_and_without_weight(make, source):
+    for weight, boundaries in ((1e4, None), (0.0, BOUNDARIES)):
+        algorithm, plain = make(f"ewc{source}", ewc_weight=weight), make(f"fine-tuning{source}")
+        ours, theirs = (play(one, 50, boundaries=boundaries)[0] for one in (algorithm, plain))
+        assert (ours == theirs).all()
+        for part in ("loss", "optimizer"):
+            assert_same(algorithm.learner.state_dict()[part], plain.learner.state_dict()[part])
     assert all(fisher.any() for fisher in algorithm.learner.fisher.values())
+
+
+def test_a_task_begins_like_a_new_expert_of_bgpo(make):
+    algorithm = make("fine-tuning-demonstrations")
+    learner, trials = algorithm.learner, algorithm.proposals
+    trials.clone_episodes = 3
+
+    def successes(seed, n_episodes):
+        """Who plays: whether the clone does."""
+        alone = []
+        for _ in range(n_episodes):
+            alone.append(trials.begin(seed, 0))
+            trials.end(seed, success=True, group=0)
+        return alone
+
+    _, state = play(algorithm, 20)
+    for seed in range(2):
+        successes(seed, 300)
+    algorithm.begin_task(1, 1)
+    assert learner.loss.n_imitated.flatten().gt(0).tolist() == [True, False]
+    assert [trials.clone_is_better(seed, 0) for seed in range(2)] == [False, True]
+    assert [all(successes(seed, 3)) for seed in range(2)] == [False, True]
+    while not learner.n_averaged[1]:
+        _, state = play(algorithm, 1, state)
+    latest = dict(learner.loss.named_parameters())
+    for name, average in learner.average.items():
+        assert average[1].equal(latest[name][1])
+        assert not average[0].equal(latest[name][0])
+
+
+def test_a_seed_that_imitates_its_successes_learns_as_alone_while_another_rests(make):
+    rl = replace(make("fine-tuning-demonstrations").config.rl, success_share=0.5)
+    both, alone = (make("fine-tuning-demonstrations", seeds, rl=rl) for seeds in (SEEDS, (2,)))
+    play(both, 40, boundaries={20: [(0, 1)]})
+    play(alone, 40)
+    for ours, own in zip(copies(both, 1), copies(alone, 0), strict=True):
+        torch.testing.assert_close(ours, own)
 
 
 def test_ewc_consolidates_once_where_several_tasks_begin_at_once(make):
