@@ -112,7 +112,7 @@ def test_a_task_begins_like_a_new_expert_of_bgpo(make):
 
     _, state = play(algorithm, 20)
     for seed in range(2):
-        successes(seed, 300)
+        successes(seed, 500)  # so many that failures before are forgotten
     algorithm.begin_task(1, 1)
     assert learner.loss.n_imitated.flatten().gt(0).tolist() == [True, False]
     assert [trials.clone_is_better(seed, 0) for seed in range(2)] == [False, True]
