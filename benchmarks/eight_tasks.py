@@ -26,7 +26,7 @@ class EightTasksArguments(SweepArguments):
         "oracle",
     )
     settings: tuple[Setting, ...] = ("eight", "eight-reversed", "eight-concurrent")
-    seeds: tuple[int, ...] | None = (10, 11, 12, 13, 14)
+    seeds: tuple[int, ...] | None = (20, 21, 22, 23, 24)
     """Seeds."""
     episodes: int | None = 4_000
     """Training episodes. The task starts are scaled in proportion."""

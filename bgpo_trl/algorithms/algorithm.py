@@ -360,6 +360,7 @@ class Algorithm(ABC):
             generator=generators(self.seeds, "demonstration replay"),
             noise=self.config.demonstration_noise,
             joints=self._demonstrated_joints(),
+            limit=self.config.state_limit,
             constant_keys=constant_keys,
             own_constants=own_constants,
             n_steps=self.config.rl.n_steps,

@@ -292,9 +292,9 @@ class BGPOConfig(AlgorithmConfig):
     """Largest number of groups per update, those played last. Ours: bounds the cost of an
     update."""
     rest_after: int = 500
-    """Training steps without being played after which a group rests: it has no part in updates and
-    its expert does not change until it is played again. Ours: from old transitions alone, an expert
-    gets worse (docs/learning.md)."""
+    """Training steps without being played after which one of several active groups rests: it has no
+    part in updates and its expert does not change until it is played again. Ours: from old
+    transitions alone, an expert gets worse (docs/learning.md)."""
     expert_batch_size: int = 128
     """Transitions of each active group per update, with experts. Ours: as many as MAML and Dist-NLL
     with demonstrations have per task; without experts, the RL algorithm's ``batch_size`` is shared

@@ -58,13 +58,15 @@ def open_complete(path: Path) -> tuple[TensorDict, dict[str, Any]]:
                 f"{path} was recorded in scene {meta['scene_version']!r}, this is "
                 f"{scene.full_version}; {_REMEDY}"
             )
-        found, known = meta["frame_shape"], [*scene.frame_shape]
-        n_actions = meta["action_size"] or scene.action_size
-        if (found, n_actions) != (known, scene.action_size):
-            raise ValueError(
-                f"{path} has frames of {found} and actions of {n_actions} numbers, the scene "
-                f"{scene.name!r} of {known} and {scene.action_size}; {_REMEDY}"
-            )
+        sizes = dict(zip(NUMBERS, ("action_size", "state_size", "joint_size"), strict=True))
+        stored = [key for key, size in sizes.items() if meta.get(size)]
+        known = layout_of(scene, stored, meta["max_steps"])
+        for key in ("frame_shape", *(sizes[name] for name in stored)):
+            if meta[key] != known.get(key, 0):
+                raise ValueError(
+                    f"{path} has the {key} {meta[key]}, the scene {scene.name!r} "
+                    f"{known.get(key, 0)}; {_REMEDY}"
+                )
     if not meta.get("checksum"):
         raise ValueError(
             f"the recording at {path} is not complete; resume it with the same command"
@@ -94,9 +96,14 @@ def make_dataset(path: Path, meta: Mapping[str, Any]) -> TensorDict:
     """Make the files of empty rows, given the settings.
 
     Raises:
+        ValueError: If the folder holds rows of a recording that was killed, or lost its settings.
         OSError: If there is not enough disk space.
     """
     make_folder(path)
+    if any(path.glob("*.memmap")):
+        raise ValueError(
+            f"{path} holds rows of a recording without {META}: remove it or choose another folder"
+        )
     columns = _empty(meta)
     size, free = sum(v.nbytes for v in columns.values()), shutil.disk_usage(path).free
     if size > free:  # Writing to a memory map on a full disk would kill the process.
@@ -455,7 +462,9 @@ def _check_episode(scene: Scene, episode: Mapping[str, Any]) -> int:
                 f"has the {key} {values.dtype} {[*values.shape]}: give {[*shape]} numbers for its "
                 f"{length} frames"
             )
-        if not np.isfinite(values).all():
+        with np.errstate(over="ignore"):
+            finite = np.isfinite(values.astype(np.float32)).all()  # as they are stored
+        if not finite:
             raise ValueError(f"has numbers in {key} that are not finite: leave the episode out")
     largest = np.abs(np.asarray(episode.get("action", 0), np.float32)).max()
     if largest > 1:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -26,6 +27,7 @@ class DemonstrationReplay:
         bank: Demonstrations that episodes are drawn from, with their steps.
         generator: Random generators for sampling, one for each of ``S`` seeds.
         noise: Standard deviation of Gaussian noise on states to imitate, by default the bank's.
+        limit: Largest size of a latent's numbers, as policies read them; None for none.
         joints: Joints in each frame of the bank's steps, as policies read them, float32
             ``[F, J]``, by which ``"latent_and_joints"`` stands in place of ``"latent"``; or None.
         constant_keys: Entries that are constant within an episode, stored with each demonstration.
@@ -44,6 +46,7 @@ class DemonstrationReplay:
         *,
         generator: Sequence[torch.Generator],
         noise: float | None = None,
+        limit: float | None = None,
         joints: Tensor | None = None,
         constant_keys: Sequence[NestedKey] = (),
         own_constants: bool = True,
@@ -68,6 +71,7 @@ class DemonstrationReplay:
         self._generators = list(generator)
         self.noise = bank.noise if noise is None else noise
         self._n_steps, self._gamma = n_steps, gamma
+        self._limit = math.inf if limit is None else limit
         self._own_constants = own_constants
         self._constant_keys = list(constant_keys)
         self._shown = GroupReplay(
@@ -141,7 +145,7 @@ class DemonstrationReplay:
 
     def _states(self, frame: Tensor) -> Tensor:
         """Return what policies read of frames int64 ``[...]``, float32 ``[..., features]``."""
-        latent = self._steps.latents(frame)
+        latent = self._steps.latents(frame).clamp(-self._limit, self._limit)
         return latent if self._joints is None else torch.cat([latent, self._joints[frame]], -1)
 
     def _draw_frames(

@@ -42,11 +42,13 @@ def check_depth(stream: Any) -> None:
     """Check that a video stream of PyAV has 8 bits a color.
 
     Raises:
-        UnreadableError: If it has more, as that of a depth map.
+        UnreadableError: If it has more, as that of a depth map or of HDR.
     """
-    name = stream.format.name
-    if name.startswith("gray") and name != "gray":
-        raise UnreadableError(f"its frames are {name}, of more than 8 bits, as of a depth map")
+    if any(component.bits > 8 for component in stream.format.components):
+        raise UnreadableError(
+            f"its frames are {stream.format.name}, of more than 8 bits, as of a depth map or of "
+            "HDR: convert it to 8 bits"
+        )
 
 
 def decode_frame(frame: Any) -> NDArray[np.uint8]:

@@ -350,8 +350,9 @@ class _Reader:
                 f"frame {late} is at {times[late]:.3f} s instead of {planned[late]:.3f} s: frames "
                 "have to follow each other evenly"
             )
-        n_read = (len(rows) - 1) // stride + 1
-        frames = self._frames(rows[::stride], times[::stride], place)
+        n_read, first_read = (len(rows) - 1) // stride + 1, (len(rows) - 1) % stride
+        # The last frame is read in any case, since it shows the success.
+        frames = self._frames(rows[first_read::stride], times[first_read::stride], place)
         if self.frame_shape is not None:
             frames = (resize_frames(frame[None], self.frame_shape)[0] for frame in frames)
         first = next(frames)
@@ -364,6 +365,7 @@ class _Reader:
             values = found.astype(np.float32)
             if found.dtype.kind in "iu" and not np.array_equal(values, found):
                 raise UnreadableError(f"{name} has whole numbers that are not exact as float32")
+            values = values[first_read:]
             is_action = key == "action"
             episode[key] = values[: (n_read - 1) * stride] if is_action else values[::stride]
         return episode

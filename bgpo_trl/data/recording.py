@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 import warnings
 from collections import Counter
@@ -127,28 +128,27 @@ def record_demonstrations(
     # The renderer comes first, so that a machine without OpenGL fails before writing anything.
     for doubt in [] if started else check_scene(scene, tasks):
         warnings.warn(f"the scene {scene.name!r}: {doubt}", stacklevel=2)
-    observation = "pixels" if scene.state is None else "both"
-    env = scene.simulate(tasks, batch_size=1, spread=spread, observation=observation)
-    dataset = open_dataset(path, wanted) if started else make_dataset(path, wanted)
-    if not started:
-        write_json(path / META, wanted)
-    recorder = _Recorder(scene, env.simulations[0], seed, attempts)
-    missing = torch.nonzero(dataset["length"] == 0).flatten().tolist()
-    bar = progress_bar(
-        "record play" if play else "record demonstrations",
-        missing,
-        shown=progress,
-        total=len(dataset),
-        initial=len(dataset) - len(missing),
-        unit="episode",
-    )
-    for row in bar:
-        task, number = divmod(int(row), per_task)
-        record = recorder.play if play else recorder.demonstrate
-        dataset["seed"][row] = seed
-        train = number < per_task - held_out_per_task
-        fill_row(dataset, row, record(tasks[task], row), task, train)
-    env.close()
+    env = scene.simulate(tasks, batch_size=1, spread=spread)
+    with contextlib.closing(env):
+        dataset = open_dataset(path, wanted) if started else make_dataset(path, wanted)
+        if not started:
+            write_json(path / META, wanted)
+        recorder = _Recorder(scene, env.simulations[0], seed, attempts)
+        missing = torch.nonzero(dataset["length"] == 0).flatten().tolist()
+        bar = progress_bar(
+            "record play" if play else "record demonstrations",
+            missing,
+            shown=progress,
+            total=len(dataset),
+            initial=len(dataset) - len(missing),
+            unit="episode",
+        )
+        for row in bar:
+            task, number = divmod(int(row), per_task)
+            record = recorder.play if play else recorder.demonstrate
+            dataset["seed"][row] = seed
+            train = number < per_task - held_out_per_task
+            fill_row(dataset, row, record(tasks[task], row), task, train)
     for task, tried in recorder.tried.items():
         if 2 * (succeeded := recorder.succeeded[task]) < tried:
             warnings.warn(
@@ -191,7 +191,8 @@ class _Recorder:
         succeeded, tried = self.succeeded[task], self.tried[task]
         raise RuntimeError(
             f"the demonstrator of {task!r} failed {self.attempts} times in a row ({succeeded} of "
-            f"{tried} attempts succeeded, {succeeded / tried:.0%}): fix it, or raise attempts"
+            f"{tried} attempts succeeded, {succeeded / tried:.0%}): fix it, or raise the "
+            "attempts of record_demonstrations"
         )
 
     def play(self, task: str, row: int) -> dict[str, np.ndarray]:
@@ -253,7 +254,7 @@ def perform(
     whose = f"an episode of the demonstrator of {task!r}"
     moments, actions, success = [observe()], [], False
     for _ in range(scene.max_steps):
-        action = np.array(act())  # a copy, since a policy may use its array again
+        action = np.array(act(), np.float64)  # a copy, since a policy may use its array again
         # Every simulation would make something else of such an action.
         if action.shape != (scene.action_size,) or not np.isfinite(action).all():
             found = short_repr(action.tolist())

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -83,8 +83,8 @@ def train_representation(
     Raises:
         ValueError: If the dataset or the configuration cannot be trained on, dataset or play show
             another scene, no imported module has the frame network, or ``checkpoint`` belongs to a
-            training with another configuration; or if ``largest_action`` leaves no action to learn
-            from, or more than a twentieth of those demonstrated out.
+            training on other data or with another configuration; or if ``largest_action`` leaves no
+            action to learn from, or more than a twentieth of those demonstrated out.
     """
     config = config or RepresentationConfig()
     check_scene(scene, dataset, play)
@@ -92,13 +92,14 @@ def train_representation(
     seen = [train] if play is None else [train, part(play, "the recorded play")]
     own = seen[-1]
     _check_actions(train, own, config.inverse)
-    fit = Fit(config, **how)
+    fit = Fit(config, **how).reading(*map(_read, seen))
     network = _frame_network(seen, fit)
     named = {}
     if network.identity != VAE.identity:
         shape = json.dumps(network.frame_shape)
         named = {"frame_network": network.identity, "frame_shape": shape}
-        fit = replace(fit, taken=f"{network.identity} {digest(network.state_dict())}")
+        weights = digest(network.state_dict())
+        fit = replace(fit, read=(*fit.read, f"{network.identity} {weights}"))
     latent = encode_frames(network, train)
     lae = _train_lae(latent, train.get("length"), fit)
     inverse = None
@@ -133,12 +134,15 @@ def retrain_inverse(
     errors are as for `train_representation`; play without actions is refused, too.
     """
     fit = Fit(config or RepresentationConfig(), **how)
+    if not fit.config.inverse.steps:
+        raise ValueError("an inverse model of 0 steps would know nothing: give it some")
     check_scene(representation.metadata.get("scene"), play, shown)
     own = part(play, "the recorded play")
     if "action" not in own:
         raise ValueError("the inverse model learns from actions, which this play lacks: record it")
     _check_actions(shown, own, fit.config.inverse)
     network = representation.frame_network.to(fit.device)
+    fit = fit.reading(_read(own), network.state_dict())
     inverse = _train_inverse(encode_frames(network, own), own, fit)
     metadata = representation.metadata
     kept = {**json.loads(metadata["config"]), "inverse": asdict(fit.config.inverse)}
@@ -158,8 +162,7 @@ class Fit:
         log: Receives a row every ``config.log_every`` steps.
         progress: Whether to show a progress bar for each stage.
         device: Device to train on.
-        taken: Identity of the frame network of one's own whose latents it is trained on, or "": a
-            checkpoint of another one is not resumed.
+        read: Digests of what the training reads, see `reading`.
     """
 
     config: RepresentationConfig
@@ -167,7 +170,16 @@ class Fit:
     log: Log | None = None
     progress: bool = True
     device: torch.device | str = "cpu"
-    taken: str = ""
+    read: tuple[str, ...] = ()
+
+    def reading(self, *tensors: Mapping[str, Tensor]) -> Fit:
+        """Return the same loop for a training that reads these tensors, too.
+
+        A checkpoint of a training that has read others is not resumed.
+        """
+        if self.checkpoint is None:
+            return self
+        return replace(self, read=(*self.read, *map(digest, tensors)))
 
     def generator(self) -> torch.Generator:
         """Return the random numbers of a stage."""
@@ -195,7 +207,7 @@ class Fit:
 
         Raises:
             ValueError: If the loss is no longer finite, or the checkpoints are damaged or belong to
-                another configuration.
+                a training on other data or with another configuration.
             OSError: If a checkpoint cannot be written.
         """
         network.to(self.device)
@@ -241,7 +253,7 @@ class Fit:
     @property
     def _settings(self) -> str:
         """All that a checkpoint has to have in common with the training that it resumes."""
-        return json.dumps(asdict(self.config)) + self.taken
+        return " ".join((json.dumps(asdict(self.config)), *self.read))
 
     def _resume(
         self,
@@ -258,13 +270,18 @@ class Fit:
             raise ValueError(f"{path} holds no checkpoint of encoders: choose another folder")
         if saved["config"] != self._settings:
             raise ValueError(
-                f"{path} was written with another configuration or frame network: "
-                "remove it or choose another folder (--folder)"
+                f"{path} is of a training on other data, or with another configuration or frame "
+                "network: remove it or choose another folder (--folder)"
             )
         network.load_state_dict(saved["network"])
         optimizer.load_state_dict(saved["optimizer"])
         generator.set_state(saved["generator"])
         return saved["step"]
+
+
+def _read(episodes: TensorDictBase) -> dict[str, Tensor]:
+    """Return what encoders learn from."""
+    return {key: episodes.get(key) for key in ("pixels", "length", "action") if key in episodes}
 
 
 def _frame_network(datasets: Sequence[TensorDictBase], fit: Fit) -> FrameNetwork:

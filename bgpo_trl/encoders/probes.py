@@ -315,6 +315,8 @@ def _probe_state(
         for part in (train, held_out)
         for chosen in [part.valid if only is None else part.valid & only(part.data.get("state"))]
     )
+    if not (len(x) and len(x_new)):
+        return {}
     linear = ridge_predict(x, state, x_new) - wanted
     read = perceptron_predict(x, state, x_new) - wanted
     joints = {
@@ -356,11 +358,15 @@ def _probe_inverse(
     names = [] if columns is None else list(columns.angles)
     if len(names) != len(left):
         names = list(range(len(left)))
-    by_joint = zip(names, (1 - left / all_).tolist(), strict=True)
+    by_joint = zip(names, left.tolist(), all_.tolist(), strict=True)
+    sums = {
+        "": (left.sum().item(), all_.sum().item()),
+        **{f"_{n}": parts for n, *parts in by_joint},
+    }
     return {
         "inverse_rmse": _mean(error.square()) ** 0.5,
-        "inverse_r2": 1 - (left.sum() / all_.sum()).item(),
-        **{f"inverse_r2_{name}": r2 for name, r2 in by_joint},
+        # In an action that is constant, there is nothing to explain.
+        **{f"inverse_r2{name}": 1 - rest / total for name, (rest, total) in sums.items() if total},
     }
 
 

@@ -26,6 +26,7 @@ from bgpo_trl.encoders.representation import (
     encode_frames,
     part,
     save_representation,
+    split,
 )
 from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.files.writing import check_folder, make_folder
@@ -87,6 +88,7 @@ def train_encoders(
     elif play is None:
         raise ValueError("to train the inverse model alone, give the folder of recorded play")
     else:
+        split(dataset)  # probed after the training
         fit = partial(retrain_inverse, keep, play, config, shown=dataset)
     make_folder(folder)
     check_folder(weights.parent)  # before hours of training

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from tensordict import TensorDict
 
@@ -36,7 +37,7 @@ def record(arguments: RecordArguments) -> str:
 
 def encoders(arguments: EncodersArguments) -> str:
     """Train both encoders on recordings, and embed these; see `train_encoders`."""
-    dataset, meta = load_demonstrations(arguments.dataset), read_meta(arguments.dataset)
+    dataset, meta = _demonstrations(arguments.dataset)
     scene, keep = find_scene(meta["scene"]), arguments.keep
     train_encoders(
         dataset,
@@ -54,6 +55,17 @@ def encoders(arguments: EncodersArguments) -> str:
     return verdict_in(arguments.folder, scene)
 
 
+def _demonstrations(path: Path) -> tuple[TensorDict, dict[str, Any]]:
+    """Open demonstrations; return them and their settings."""
+    meta = read_meta(path)
+    if meta.get("play"):
+        raise ValueError(
+            f"{path} holds play, which is no demonstration: give the folder of demonstrations "
+            "first, that of play second"
+        )
+    return load_demonstrations(path), meta
+
+
 def _play(path: Path | None) -> TensorDict | None:
     """Open recorded play, if any."""
     return None if path is None else load_demonstrations(path)
@@ -61,12 +73,12 @@ def _play(path: Path | None) -> TensorDict | None:
 
 def bank(arguments: MakeBankArguments) -> str:
     """Embed a recorded dataset with trained encoders; see `make_bank`."""
-    meta = read_meta(arguments.dataset)
+    dataset, meta = _demonstrations(arguments.dataset)
     scene = find_scene(meta["scene"])
     weights = arguments.encoders or default_weights(scene=scene)
     made = make_bank(
         load_representation(weights, scene=scene),
-        load_demonstrations(arguments.dataset),
+        dataset,
         tasks=meta["tasks"],
         actions=arguments.actions or scene.bank_actions,
         spread=meta["spread"],
@@ -78,7 +90,7 @@ def bank(arguments: MakeBankArguments) -> str:
 
 def probes(arguments: ProbesArguments) -> str:
     """Evaluate trained encoders with probes; see `probe`."""
-    meta, dataset = read_meta(arguments.dataset), load_demonstrations(arguments.dataset)
+    dataset, meta = _demonstrations(arguments.dataset)
     scene = find_scene(meta["scene"])
     weights = arguments.encoders or default_weights(meta["tasks"], scene=scene)
     representation, play = load_representation(weights, scene=scene), _play(arguments.play)

@@ -1,7 +1,7 @@
 """Policies and Q-function: perceptrons, with an optional stack of seeds in their weights.
 
 Paper, Sec. IV-A: one hidden layer of 64 ReLU units, and an output layer that is linear in the
-Q-function and tanh in the policy. The default here is one of 256 units (`RLConfig.hidden_sizes`).
+Q-function and tanh in the policy. The default here is two of 256 units (`RLConfig.hidden_sizes`).
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,6 +20,7 @@ from bgpo_trl.modules.gwr import Numbers, as_tensor
 
 _KNOWN_SHARE = 0.99  # of a group's own demonstrations that are to count as known
 _FITTING_SHARE = 0.9  # of a group's own demonstrations whose starts are to count as fitting
+_BETWEEN_CODES = 0.02  # of a start's numbers, as a bank stores them
 _ROUNDING = 1e-4  # of a vector's length; shipped demonstrations differ by 600 times as much
 # After the first ten to twenty demonstrations of a new task, which experts of other tasks solve in
 # 5 to 8 % of cases, four successes are rare.
@@ -209,7 +211,10 @@ class BehaviorGroups:
             return True
         start, starts = as_tensor(start, "start").cpu().float(), torch.from_numpy(self.starts[rows])
         apart = torch.cdist(starts, starts).fill_diagonal_(torch.inf).amin(-1)
-        return bool(torch.cdist(start[None], starts).amin() <= apart.quantile(_FITTING_SHARE))
+        # Where all episodes begin alike, a start still differs from those that a bank has stored.
+        least = _BETWEEN_CODES * math.sqrt(starts.shape[1])
+        limit = apart.quantile(_FITTING_SHARE).clamp_min(least)
+        return bool(torch.cdist(start[None], starts).amin() <= limit)
 
     def expert(self, start: Numbers, group: int) -> tuple[int, bool]:
         """Return the group whose expert is to play an episode.

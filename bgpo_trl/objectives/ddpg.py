@@ -57,7 +57,8 @@ class DDPGLoss(LossModule):
     1. *Critics.* All ``N`` critics learn ``r + gamma ** k * V(s')``, where ``k`` is 1 or the number
        of steps of the transition. ``V`` is the lower value of two target critics. All pairs
        take turns, one in each call of `loss_value` (Chen et al., 2021, "Randomized Ensembled Double
-       Q-Learning", draw pairs at random).
+       Q-Learning", draw pairs at random). If the actor learns in every second call, it sees every
+       second pair.
     2. *Actor.* The actor ascends the mean of the same two critics. With a weight of ``imitation``,
        it descends the squared distance to demonstrated actions too (Nair et al., 2018, "Overcoming
        Exploration in Reinforcement Learning with Demonstrations"). The weight fades (Rajeswaran et

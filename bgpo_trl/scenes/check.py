@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from bgpo_trl.scenes.scene import (
     Scene,
     Simulation,
+    check_executed,
     checked_frame,
     checked_numbers,
     checked_step,
@@ -112,7 +113,7 @@ class _Trial:
                 )
             prompt |= any(differ(*pair) for pair in pairs[::_N_STEPS])
             self.start(0)
-            checked_step(self.simulation, push)
+            check_executed(checked_step(self.simulation, push), push)
             if differ(self.frame(), self.frame()):
                 return ["frame() differs when called twice: is it that of the step before?"]
         if len(doubts) < size and not prompt:

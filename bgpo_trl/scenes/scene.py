@@ -154,6 +154,15 @@ def checked_step(simulation: Simulation, action: NDArray[np.float64]) -> Outcome
     return outcome._replace(executed=executed.astype(np.float64))
 
 
+def check_executed(outcome: Outcome, action: NDArray[np.float64]) -> None:
+    """Raise ``ValueError`` if a simulation says that it executed another action than asked for."""
+    if outcome.executed is not action:
+        raise ValueError(
+            "a simulation executes what it is asked: leave Outcome.executed out, or, for a real "
+            "robot, make the environment a RobotEnv"
+        )
+
+
 def _refusal(simulation: Simulation, method: str, found: str, wanted: str) -> ValueError:
     found = " ".join(found.split())
     return ValueError(f"{type(simulation).__name__}.{method}() returned {found}: return {wanted}")
@@ -193,6 +202,15 @@ class StateColumns:
                 raise ValueError(
                     f"column {column} of the ground truth has the center {center} and the scale "
                     f"{scale}: give finite numbers, the scale above 0, such as 1 for a constant"
+                )
+
+        named = [*self.angles.items()]
+        named += [(name, column) for name, place in self.places.items() for column in place]
+        for name, column in named:
+            if not 0 <= column < self.size:
+                raise ValueError(
+                    f"{name!r} is read from column {column} (from 0) of the ground truth, which "
+                    f"has {self.size}: correct angles or places"
                 )
 
     @property

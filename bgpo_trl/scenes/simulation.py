@@ -18,6 +18,7 @@ from bgpo_trl.scenes.scene import (
     Observation,
     Outcome,
     Simulation,
+    check_executed,
     checked_frame,
     checked_numbers,
     checked_step,
@@ -227,11 +228,8 @@ class SimulationEnv(EnvBase):
             self._success[row], self._failure[row] = outcome[:2]
             if "executed_action" in self._current:
                 self._current["executed_action"][row] = outcome.executed
-            elif outcome.executed is not asked[row]:
-                raise ValueError(
-                    "a simulation executes what it is asked: leave Outcome.executed out, or, for a "
-                    "real robot, make the environment a RobotEnv"
-                )
+            else:
+                check_executed(outcome, asked[row])
 
         self._threads.each(asked, step, record)
 

@@ -29,8 +29,12 @@ from tests.helpers import contents, edit
         (lambda p: (p / "dataset.json").unlink(), "not a dataset of demonstrations"),
         (lambda p: edit(p / "dataset.json", checksum=None), "not complete; resume it"),
         (lambda p: edit(p / "dataset.json", scene_version="old"), "recorded in scene 'old'"),
-        (lambda p: edit(p / "dataset.json", action_size=3), "and actions of 3 numbers"),
-        (lambda p: edit(p / "dataset.json", frame_shape=[8, 8]), r"frames of \[8, 8\] and actions"),
+        (lambda p: edit(p / "dataset.json", action_size=3), r"action_size 3, the scene 'nico' 4"),
+        (lambda p: edit(p / "dataset.json", state_size=3), r"state_size 3, the scene 'nico' 16"),
+        (
+            lambda p: edit(p / "dataset.json", frame_shape=[8, 8]),
+            r"frame_shape \[8, 8\], the scene",
+        ),
     ],
 )
 def test_what_is_not_whole_is_refused_in_one_line(copy, damage, message):
@@ -172,6 +176,7 @@ MISSING = {**episodes_of(), TASKS[1]: [episode_of(2), episode_of(7), None, episo
             "action that are not finite",
             "leave the episode out",
         ),
+        (changed(state=np.full((6, 16), 1e39)), "state that are not finite", "leave the episode"),
         (changed(state=np.zeros((6, 15))), "has the state", "give [6, 16] numbers"),
         ({}, "there are no episodes", "give some"),
         ({**episodes_of(), "push_green_to_glass": []}, "no episode of", "leave the task out"),

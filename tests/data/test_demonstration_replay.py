@@ -49,6 +49,15 @@ def make_shown(bank):
 GROUP = torch.tensor([[0, 0, 1, -1, 2], [0, 2, 2, 0, 1]])
 
 
+def test_states_are_bounded_as_those_of_episodes(make_shown):
+    bounded, plain = make_shown(limit=0.5, noise=0.0), make_shown(noise=0.0)
+    for draw in ("draw", "draw_actions"):
+        ours, theirs = (getattr(replay, draw)(GROUP) for replay in (bounded, plain))
+        for key in {"latent", ("next", "latent")} & ours.keys():
+            assert theirs[key].abs().max() > 0.5
+            assert ours[key].equal(theirs[key].clamp(-0.5, 0.5))
+
+
 def transitions(steps, index, n_steps):
     """All of a demonstration's, from its frames: latent, action, steps, next latent, the end."""
     frames = torch.arange(int(steps.length[index])) + steps.first[index]

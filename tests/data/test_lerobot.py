@@ -298,7 +298,9 @@ def test_some_episodes_tasks_and_frames_are_read(written):
     np.testing.assert_array_equal(one["pixels"], dataset["pixels"][0, first])
     summed = dataset["action"][0].unflatten(0, (2, 2)).sum(1)  # frames 0 to 2 and 2 to 4
     np.testing.assert_array_equal(one["action"], summed)
-    assert len(two["pixels"]) == 2 and two["action"].shape == (1, 4)  # of frames 0 to 3
+    # Of frames 0 to 3: the last one shows the success.
+    np.testing.assert_array_equal(two["pixels"], dataset["pixels"][2, 1:4:2])
+    np.testing.assert_array_equal(two["action"], dataset["action"][2, 1:3].sum(0, keepdim=True))
     last = read_lerobot(written, episodes=[0], stride=2, combine=lambda a: a[-1])[TASKS[1]][0]
     np.testing.assert_array_equal(last["action"], dataset["action"][0, 1::2])
 
@@ -508,7 +510,8 @@ def test_episodes_that_overlap_in_a_video_are_refused(written, film, refused):
     refused(lambda: read_lerobot(written, episodes=[0]), cause, "get it again")
 
 
-def test_a_video_of_numbers_of_sixteen_bits_is_refused(written, film):
-    film(pix_fmt="gray16le", codec="ffv1")
-    with pytest.raises(ValueError, match="its frames are gray16le, of more than 8 bits"):
+@pytest.mark.parametrize("depth", ["gray16le", "yuv420p10le"])
+def test_a_video_of_more_than_eight_bits_a_color_is_refused(written, film, depth):
+    film(pix_fmt=depth, codec="ffv1")
+    with pytest.raises(ValueError, match=f"its frames are {depth}, of more than 8 bits"):
         read_lerobot(written)

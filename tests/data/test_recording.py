@@ -4,13 +4,18 @@ import pytest
 import torch
 
 from bgpo_trl.data import recording as demonstrations
-from bgpo_trl.data.dataset import load_demonstrations, open_dataset, read_meta
+from bgpo_trl.data.dataset import META, load_demonstrations, open_dataset, read_meta
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.experiments.arguments import RecordArguments
-from bgpo_trl.experiments.make_data import record
+from bgpo_trl.experiments.arguments import (
+    EncodersArguments,
+    MakeBankArguments,
+    ProbesArguments,
+    RecordArguments,
+)
+from bgpo_trl.experiments.make_data import bank, encoders, probes, record
 from suites import nico
 from tests.helpers import contents
-from tests.scenes.dot import demonstrate, record_some, scene
+from tests.scenes.dot import Dot, demonstrate, record_some, scene
 
 TINY = {"per_task": 3, "held_out_per_task": 1, "progress": False}
 KEYS = {"pixels", "state", "joints", "action", "length", "task", "train", "seed"}
@@ -92,7 +97,7 @@ def test_a_demonstrator_that_never_succeeds_is_told_of(tmp_path, monkeypatch):
         record_demonstrations(tmp_path, attempts=3, progress=False, **options)
     told = re.fullmatch(
         r"the demonstrator of 'fickle' failed 3 times in a row \(2 of (\d+) attempts succeeded, "
-        r"(\d+)%\): fix it, or raise attempts",
+        r"(\d+)%\): fix it, or raise the attempts of record_demonstrations",
         str(raised.value),
     )
     assert int(told[1]) >= 5
@@ -138,6 +143,27 @@ def test_an_interrupted_recording_ends_as_an_uninterrupted_one(recorded, tmp_pat
     assert contents(tmp_path) == contents(recorded)
 
 
+def test_rows_of_a_recording_without_settings_are_not_taken_for_new_ones(copy):
+    (copy / META).unlink()
+    with pytest.raises(ValueError, match=f"rows of a recording without {META}: remove it"):
+        record_demonstrations(copy, **TINY)
+
+
+def test_the_environment_is_closed_if_a_recording_fails(tmp_path):
+    closed = []
+
+    class Watched(Dot):
+        def close(self):
+            closed.append(self)
+
+    def broken(simulation, task, seed):
+        raise RuntimeError("no power")
+
+    with pytest.raises(RuntimeError, match="no power"):
+        record_some(tmp_path, scene(Watched, demonstrator=broken))
+    assert len(closed) == 3  # two of check_scene
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
@@ -158,3 +184,15 @@ def test_the_command_records_all_tasks_by_one_word_and_says_what_it_made(tmp_pat
 
     assert read_meta(tmp_path)["tasks"] == list(nico.ALL_TASKS)
     assert said == f"8 demonstrations, 0 of them held out: {tmp_path}"
+
+
+def test_play_is_not_taken_for_demonstrations(tmp_path, refused):
+    play = tmp_path / "play"
+    record_demonstrations(play, tasks=["press_white"], play=True, **TINY)
+    for call in (
+        lambda: bank(MakeBankArguments(dataset=play, out=tmp_path / "bank")),
+        lambda: encoders(EncodersArguments(dataset=play, play=play)),
+        lambda: probes(ProbesArguments(dataset=play, out=tmp_path / "probes")),
+    ):
+        refused(call, f"{play} holds play, which is no demonstration", "first, that of play second")
+    assert [*tmp_path.iterdir()] == [play]

@@ -189,6 +189,9 @@ def test_the_inverse_model_alone_is_trained_as_with_the_other_encoders(tmp_path:
     play, more = squares(10), squares(14)
     trained = train(squares(8), play=play, command="first")
     assert same(trained, retrain_inverse(trained, play, TINY, progress=False))
+    none = replace(TINY, inverse=replace(TINY.inverse, steps=0))
+    with pytest.raises(ValueError, match="an inverse model of 0 steps"):
+        retrain_inverse(trained, play, none, progress=False)
     wider = replace(TINY, inverse=replace(TINY.inverse, hidden_size=16))
     with_more = retrain_inverse(trained, more, wider, command="then", progress=False)
     assert same(trained, replace(with_more, inverse=trained.inverse))
@@ -347,3 +350,18 @@ def test_bfloat16_is_left_out_where_it_would_be_emulated(monkeypatch, tiny):
     with pytest.warns(UserWarning, match="no instructions for bfloat16"):
         other = train(squares(8), replace(TINY, vae=replace(TINY.vae, bfloat16=True)))
     assert other.identity == tiny.identity
+
+
+def test_a_checkpoint_of_a_training_on_other_data_is_not_resumed(tmp_path):
+    first, others = squares(8), squares(12)
+    trained = train(first, checkpoint=tmp_path / "all", play=first)
+    assert same(trained, train(first, checkpoint=tmp_path / "all", play=first))
+    retrained = retrain_inverse(trained, first, TINY, progress=False, checkpoint=tmp_path / "kept")
+    for changed in ({"dataset": others, "play": first}, {"dataset": first, "play": others}):
+        with pytest.raises(ValueError, match="a training on other data"):
+            train(**changed, checkpoint=tmp_path / "all")
+    for encoders, play in ((trained, others), (train(others), first)):
+        with pytest.raises(ValueError, match="a training on other data"):
+            retrain_inverse(encoders, play, TINY, progress=False, checkpoint=tmp_path / "kept")
+    again = retrain_inverse(trained, first, TINY, progress=False, checkpoint=tmp_path / "kept")
+    assert same(retrained, again)

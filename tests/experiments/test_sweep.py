@@ -90,7 +90,7 @@ def test_the_benchmark_of_eight_tasks_is_a_grid_with_tests_every_50_episodes(mon
     grid = sweep.make_jobs(asked[0])
     assert len(grid) == 3 * 8
     for job in grid:
-        assert job.config.seeds == (10, 11, 12, 13, 14)
+        assert job.config.seeds == (20, 21, 22, 23, 24)
         assert (job.config.held_out, len(job.config.tasks)) == ("test", 8)
     more = SweepArguments(settings=("eight-sequential", "sequential"), episodes=4_000)
     config = {job.directory.parent.name: job.config for job in grid + sweep.make_jobs(more)}

@@ -65,6 +65,14 @@ def test_a_start_fits_a_group_whose_demonstrations_began_like_it():
         assert few.fits(RIGHT, 0) == (row < 3)
 
 
+def test_starts_that_a_bank_has_rounded_fit_where_all_episodes_begin_alike():
+    groups = BehaviorGroups(4, smallest=4)
+    for embedding in EMBEDDINGS[:8]:
+        groups.adapt(embedding, torch.full((9,), 0.04))
+    assert groups.fits(torch.full((9,), 0.0599), 0)  # half a code of 1 / 25 off
+    assert not groups.fits(torch.full((9,), 0.07), 0)
+
+
 def test_starts_are_those_of_all_demonstrations_or_none():
     groups, plain = make(), BehaviorGroups(4)
     plain.adapt(EMBEDDINGS[0])

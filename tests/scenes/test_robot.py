@@ -10,6 +10,7 @@ from torchrl.envs import check_env_specs
 from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
 from bgpo_trl.runs.results import read_table
 from bgpo_trl.scenes import SCENES, Outcome, RobotEnv, SimulationEnv
+from bgpo_trl.scenes.check import check_scene
 from tests.helpers import finish
 from tests.scenes.dot import (
     SHAPE,
@@ -65,6 +66,8 @@ def test_executed_actions_that_are_none_are_refused(wrong):
 def test_executed_actions_are_not_lost_in_an_environment_of_simulations():
     with pytest.raises(ValueError, match=r"leave Outcome\.executed out"):
         stepped(SimulationEnv(Limited, TASKS, **SHAPE), 0.7)
+    with pytest.raises(ValueError, match=r"leave Outcome\.executed out"):
+        check_scene(robot_scene(env=SimulationEnv))
 
 
 def test_recordings_hold_the_executed_actions(tmp_path):

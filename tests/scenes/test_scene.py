@@ -312,6 +312,12 @@ def test_what_a_simulation_returns_is_checked(tmp_path, method, value, message):
             call()
 
 
+@pytest.mark.parametrize("named", [{"angles": {"cup": 2}}, {"places": {"cup": (0, -1, 2)}}])
+def test_columns_that_the_ground_truth_lacks_are_refused(named):
+    with pytest.raises(ValueError, match=r"'cup' is read from column -?\d .* has 2: correct"):
+        StateColumns(center=(0.0, 0.0), scale=(1.0, 1.0), **named)
+
+
 @pytest.mark.parametrize(
     "column", [(0.0, 0.0), (0.0, np.inf), (np.nan, 1.0), (0.0, -1.0), (0.1, 1.4e-17), (0.0, 1e-46)]
 )
