@@ -407,8 +407,9 @@ class StandIn(ModuleType):
         super().__init__("av")
         self.__spec__ = ModuleSpec("av", None)
         self.kept = [*kept]
+        bits = 8 if pix_fmt == "yuv420p" else 16
         stream = SimpleNamespace(
-            format=SimpleNamespace(name=pix_fmt),
+            format=SimpleNamespace(name=pix_fmt, components=[SimpleNamespace(bits=bits)]),
             time_base=Fraction(1, 5),
             start_time=0,
             duration=self.kept[-1] + 1,

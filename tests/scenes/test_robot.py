@@ -67,7 +67,7 @@ def test_executed_actions_are_not_lost_in_an_environment_of_simulations():
     with pytest.raises(ValueError, match=r"leave Outcome\.executed out"):
         stepped(SimulationEnv(Limited, TASKS, **SHAPE), 0.7)
     with pytest.raises(ValueError, match=r"leave Outcome\.executed out"):
-        check_scene(robot_scene(env=SimulationEnv))
+        check_scene(scene(Limited))
 
 
 def test_recordings_hold_the_executed_actions(tmp_path):
