@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -154,13 +155,17 @@ def _setting(runs: list[Run]) -> Setting:
     )
     for run in runs[1:]:
         check_conditions(runs[0], run)
-    names = [title_of(run) for run in runs]
-    return Setting(
-        {
-            name if names.count(name) == 1 else f"{name} ({run.name})": run
-            for name, run in zip(names, runs, strict=True)
-        }
-    )
+    named: dict[str, Run] = {}
+    for run in runs:
+        title = title_of(run)
+        alike = [str(other.place.resolve()) for other in runs if title_of(other) == title]
+        if len(alike) > 1:
+            within = run.place.resolve().relative_to(os.path.commonpath(alike))
+            title += f" ({run.place.name if within == Path() else within})"
+        if title in named:
+            raise ValueError(f"{run.directory} is given twice: name each run once")
+        named[title] = run
+    return Setting(named)
 
 
 def reference_of(setting: Setting, settings: Iterable[Setting]) -> Setting | None:

@@ -208,17 +208,22 @@ def groups_section(setting: Setting) -> list[Section]:
 def cost_section(setting: Setting) -> list[Section]:
     """Return the cost of training by the number of presented tasks, of all seeds."""
     note = "Of all seeds together, without tests: time of a training step, and memory."
+    # Runs of single seeds, joined, are added up.
     costs = {
-        name: run.costs.groupby("tasks").sum()
+        name: run.costs.assign(
+            ms=1000 * run.costs["seconds"] / run.costs["steps"].where(run.costs["steps"] > 0)
+        )
+        .groupby("tasks")
+        .sum()
         for name, run in setting.runs.items()
         if run.costs is not None and len(run.costs)
     }
     numbers = sorted({tasks for of_run in costs.values() for tasks in of_run.index})
     rows = [["", "hours", *(f"{number} task{'s' * (number > 1)}" for number in numbers)]]
     for name, of_run in costs.items():
-        seconds, megabytes = of_run["seconds"] / of_run["steps"], of_run["megabytes"]
+        milliseconds, megabytes = of_run["ms"], of_run["megabytes"]
         cells = [
-            f"{1000 * seconds[number]:.1f} ms, {megabytes[number]:.0f} MB"
+            f"{milliseconds[number]:.1f} ms, {megabytes[number]:.0f} MB"
             if number in of_run.index and of_run["steps"][number]
             else "-"
             for number in numbers

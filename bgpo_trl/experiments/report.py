@@ -108,10 +108,14 @@ def report(arguments: ReportArguments) -> str:
         copies = [arguments.archive / name for folder in named for name in _names_in(folder)]
         if len({*copies}) < len(copies):
             raise ValueError("--archive: runs of the same name are given, use one folder for each")
-        read_settings(directories)  # Refuses before copying.
-        for directory, copy in zip(directories, copies, strict=True):
-            archive_run(directory, copy)
-        directories = copies
+        found, _ = read_settings(directories)  # Refuses before copying.
+        runs = [run for setting in found for run in setting.runs.values()]
+        finished = {directory for run in runs for directory in run.directories}
+        targets = [*zip(directories, copies, strict=True)]
+        directories = [copy for directory, copy in targets if directory in finished]
+        for directory, copy in targets:
+            if directory in finished:
+                archive_run(directory, copy)
     settings, left_out = read_settings(directories)
     sections = [Section("Left out", notes=[left_out])] if left_out else []
     for setting in settings:
@@ -122,4 +126,8 @@ def report(arguments: ReportArguments) -> str:
 def _names_in(folder: Path) -> list[Path]:
     """Return the paths of the runs in a folder, relative to it; of a run, its name."""
     runs = run_directories([folder])
-    return [Path(folder.name)] if runs == [folder] else [run.relative_to(folder) for run in runs]
+    return (
+        [Path(folder.resolve().name)]
+        if runs == [folder]
+        else [run.relative_to(folder) for run in runs]
+    )

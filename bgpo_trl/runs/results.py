@@ -170,9 +170,9 @@ class Run:
         return self.directories[0]
 
     @property
-    def name(self) -> str:
-        """Name of the directory, or of the folder of several."""
-        return (self.directory if len(self.directories) == 1 else self.directory.parent).name
+    def place(self) -> Path:
+        """The directory, or the folder of several."""
+        return self.directory if len(self.directories) == 1 else self.directory.parent
 
     @property
     def algorithm(self) -> str:

@@ -165,7 +165,7 @@ def split(run, folder):
         summary = json.loads((run / "summary.json").read_text())
         lists = {name: [summary[name][seed]] for name in ("nodes", "groups", "group_purity")}
         edit(part / "summary.json", **lists)
-        costs = "tasks,steps,seconds,megabytes\n1,10,0.1,0.6667\n3,20,0.3,3\n"
+        costs = "tasks,steps,seconds,megabytes\n1,30,0.1,0.6667\n3,60,0.3,3\n"
         (part / "cost.csv").write_text(costs)
 
 
