@@ -188,8 +188,7 @@ class Algorithm(ABC):
             *(transform.clone() for transform in self.conditioning),
         ]
         if self.beta:
-            if self.encoders is None:
-                raise ValueError("matching behaviors needs trained encoders")
+            assert self.encoders is not None  # which latents need
             # reward + beta * exp(-||b - phi_g||)
             transforms.append(BehaviorMatchingReward(self.encoders.lae, self.beta))
         transforms += [*bound(config, self.joints), RewardSum()]  # episode_reward, ...

@@ -314,6 +314,8 @@ class BGPOConfig(AlgorithmConfig):
         super().__post_init__()
         at_least(self, 0, "beta")
         at_least(self, 1, "active_groups", "rest_after", "expert_batch_size")
+        seen = self.state == "latent" or self.context not in ("behavior", "embedding")
+        check(self, ("beta", seen or not self.beta, "0 with the ground truth: it compares latents"))
         positive(self, "behavior_scale", "group_evidence")
         at_least(self, 4, "group_size")
         holds = self.group_balanced_replay or not self.experts

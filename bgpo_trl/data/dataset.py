@@ -58,10 +58,9 @@ def open_complete(path: Path) -> tuple[TensorDict, dict[str, Any]]:
                 f"{path} was recorded in scene {meta['scene_version']!r}, this is "
                 f"{scene.full_version}; {_REMEDY}"
             )
-        sizes = dict(zip(NUMBERS, ("action_size", "state_size", "joint_size"), strict=True))
-        stored = [key for key, size in sizes.items() if meta.get(size)]
+        stored = [key for key in NUMBERS if meta.get(f"{key.removesuffix('s')}_size")]
         known = layout_of(scene, stored, meta["max_steps"])
-        for key in ("frame_shape", *(sizes[name] for name in stored)):
+        for key in ("frame_shape", *(f"{name.removesuffix('s')}_size" for name in stored)):
             if meta[key] != known.get(key, 0):
                 raise ValueError(
                     f"{path} has the {key} {meta[key]}, the scene {scene.name!r} "

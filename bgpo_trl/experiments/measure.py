@@ -60,7 +60,7 @@ def measure(
         "command": command(),
         "episodes": config.episodes,
         "random_success": dict(zip(config.tasks, random_success.tolist(), strict=True)),
-        "demonstrated_steps": demonstrated_steps(bank.seen()),
+        "demonstrated_steps": demonstrated_steps(bank.seen(config.demonstrations)),
         "needs_label": algorithm.needs_label,
         "needs_boundaries": algorithm.needs_boundaries,
         "nodes": None if gwr is None else gwr.num_nodes.tolist(),
@@ -88,7 +88,8 @@ def demonstrated_steps(bank: DemonstrationBank) -> dict[str, float]:
 
 def _final_tests(trainer: Trainer, bank: DemonstrationBank, *, episodes: int) -> pd.DataFrame:
     """Return the rows of ``final.csv``, after as many test episodes of each task and kind."""
-    algorithm, config, seen = trainer.algorithm, trainer.config, bank.seen()
+    algorithm, config = trainer.algorithm, trainer.config
+    seen = bank.seen(config.demonstrations)
     gwr, rows = algorithm.gwr, []
     n_steps = config.algorithm.max_steps + 1
     bar = progress_bar("final tests", shown=trainer.progress, total=2 * n_steps, unit="step")
@@ -135,12 +136,15 @@ def draw(
     save_figure(plot_success_curves({config.name: run}), out / "figures" / "success.png")
     if (run.tests["success"] == 1).any():
         save_figure(plot_step_curves({config.name: run}), out / "figures" / "steps.png")
-    episodes = record_episodes(trainer, bank)
-    save_figure(plot_frame_strips(episodes), out / "figures" / "episodes.png")
-    for name, frames in zip(file_names(config.tasks), episodes.values(), strict=True):
+    # A policy of the ground truth needs no frames, so there are none.
+    episodes = record_episodes(trainer, bank) if config.algorithm.state == "latent" else {}
+    if episodes:
+        save_figure(plot_frame_strips(episodes), out / "figures" / "episodes.png")
+    for name, frames in zip(file_names(config.tasks), episodes.values(), strict=False):
         save_gif(frames, out / "figures" / f"{name}.gif", fps=find_scene(config.scene).rate or 5.0)
     if summary["nodes"] is not None:
-        save_figure(plot_first_gwr(trainer.algorithm, bank.seen()), out / "figures" / "gwr.png")
+        seen = bank.seen(config.demonstrations)
+        save_figure(plot_first_gwr(trainer.algorithm, seen), out / "figures" / "gwr.png")
         inferred = np.asarray(final_means(run, "held-out", "task_inference"))
         lines.append(f"GWR-B nodes: {summary['nodes']}")
         lines.append(f"task inference on held-out demonstrations: {inferred.mean():.1%}")

@@ -71,14 +71,15 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
     out = named_directory(arguments) or Path("runs") / f"{group}-{size}"
     digests: Digests | None = None
     grown: Grown | None = None
-    verdict = ""
+    verdict, added = "", arguments.add_task
     if not arguments.resume and holds_run(out):
         raise ValueError(f"{out} holds a run: --resume continues it, --out names another directory")
     if arguments.resume and (out / "config.json").exists():
         saved, digests = read_config(out / "config.json")
         config = _continued(arguments, config, saved)
-        same = arguments.add_task is None and saved == config
-        if same and is_finished(out, config.episodes):
+        if added in saved.tasks[-1:]:  # the same command once more
+            added = None
+        if added is None and saved == config and is_finished(out, config.episodes):
             return f"{out} is finished, all {config.episodes} episodes: --episodes makes it longer"
     loggers: list[Callable[[], Logger]] = []
     if arguments.wandb is not None:
@@ -87,10 +88,10 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
     if arguments.tensorboard:
         check_installed("tensorboard")
         loggers.append(partial(tensorboard_logger, out))
-    if arguments.add_task is not None:
-        grown = add_task(out, arguments.add_task, config=config, bank=arguments.bank)
+    if added is not None:
+        grown = add_task(out, added, config=config, bank=arguments.bank)
         config, seen = grown.config, distinctness(grown.bank)
-        verdict = f"{arguments.add_task}: {seen}"
+        verdict = f"{added}: {seen}"
         if not seen.clear:
             warnings.warn(verdict, stacklevel=2)
     with lock_directory(out):

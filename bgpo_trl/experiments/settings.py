@@ -11,6 +11,7 @@ import tyro
 
 from bgpo_trl.algorithms import ALGORITHMS, entry
 from bgpo_trl.configs import PRESETS, RunConfig
+from bgpo_trl.configs.algorithms import AlgorithmConfig
 from bgpo_trl.experiments.arguments import SETTINGS, Arguments
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.directory import differing_settings
@@ -26,9 +27,9 @@ def run_config(
         ValueError: If the settings are invalid, or a file, task or algorithm does not exist.
     """
     config, name = _begin(arguments), arguments.algorithm
-    if name is not None:
-        config = replace(config, name=name, algorithm=entry(name).config)
     scene = find_scene(arguments.scene or config.scene)
+    if name is not None and name != config.name:
+        config = replace(config, name=name, algorithm=_fitting(entry(name).config, scene))
     if scene.name != config.scene:
         config = _in_scene(config, scene)
     if arguments.tasks is not None:
@@ -91,10 +92,14 @@ def named_directory(arguments: Arguments) -> Path | None:
 
 def _in_scene(config: RunConfig, scene: Scene) -> RunConfig:
     """Return a run of the usual tasks of another scene, with episodes of their length."""
-    rl = config.algorithm.rl
-    rl = replace(rl, warmup_steps=max(rl.warmup_steps, scene.max_steps))
-    algorithm = replace(config.algorithm, max_steps=scene.max_steps, rl=rl)
+    algorithm = _fitting(config.algorithm, scene)
     return _with_tasks(replace(config, scene=scene.name, algorithm=algorithm), scene.default_tasks)
+
+
+def _fitting(algorithm: AlgorithmConfig, scene: Scene) -> AlgorithmConfig:
+    """Return hyperparameters with episodes as long as a scene's."""
+    rl = replace(algorithm.rl, warmup_steps=max(algorithm.rl.warmup_steps, scene.max_steps))
+    return replace(algorithm, max_steps=scene.max_steps, rl=rl)
 
 
 def _with_tasks(config: RunConfig, tasks: tuple[str, ...]) -> RunConfig:

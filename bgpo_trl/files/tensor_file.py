@@ -20,7 +20,7 @@ def digest(tensors: Mapping[str, Tensor]) -> str:
     sha256 = hashlib.sha256()
     for key in sorted(tensors):
         sha256.update(key.encode())
-        sha256.update(tensors[key].cpu().contiguous().numpy())
+        sha256.update(tensors[key].cpu().contiguous().numpy().data)
     return sha256.hexdigest()
 
 

@@ -143,13 +143,14 @@ def test_targets_are_clipped_to_the_attainable_returns(make_bgpo, variant, chang
 
 
 def test_what_an_algorithm_lacks_is_refused(make_config, bank, in_world):
-    for state in ("latent", "state"):
-        config = make_config(state, "without-gwr").algorithm
-        with pytest.raises(ValueError, match="needs trained encoders"):
-            in_world(BGPO(config, seeds=(0,), bank=bank.seen()), (0,), SCHEDULE)
+    config = make_config(name="without-gwr").algorithm
+    with pytest.raises(ValueError, match="needs trained encoders"):
+        in_world(BGPO(config, seeds=(0,), bank=bank.seen()), (0,), SCHEDULE)
     config = replace(make_config("state", "oracle").algorithm, demonstration_share=0.25)
     with pytest.raises(ValueError, match="demonstrations are latents"):
         BGPO(config, seeds=(0,), bank=bank.seen())
+    with pytest.raises(ValueError, match="beta must be 0 with the ground truth"):
+        replace(make_config(name="without-gwr").algorithm, state="state")
     with pytest.raises(ValueError, match="demonstration_share must be above 0 for a policy"):
         replace(make_config().algorithm, demonstration_share=0.0)
 

@@ -5,6 +5,7 @@ import shutil
 from collections import Counter
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -216,3 +217,26 @@ def test_other_conditions_are_refused_before_anything_is_written(tmp_path, refus
     for archive in (None, tmp_path / "archive"):
         asked = ReportArguments((tmp_path,), archive=archive)
         refused(partial(report, asked), "differ in held_out (validation and test)", "only runs")
+
+
+def test_runs_whose_folders_have_one_name_are_reported_apart(tmp_path, refused):
+    for folder, level in (("old", 9), ("new", 5)):
+        write_run(tmp_path / folder, "bgpo", level)
+    report(ReportArguments((tmp_path / "old", tmp_path / "new"), out=tmp_path))
+    rows = table_of(tmp_path, "3 tasks, all from the start")
+    assert {name: row[2] for name, row in rows.items() if "BGPO" in name} == {
+        "BGPO (old/concurrent-bgpo)": "90.0 [90, 90]",
+        "BGPO (new/concurrent-bgpo)": "50.0 [50, 50]",
+    }
+    twice = ReportArguments((tmp_path / "old", tmp_path / "old"), out=tmp_path)
+    refused(partial(report, twice), "concurrent-bgpo is given twice", "name each run once")
+
+
+def test_only_finished_runs_are_archived_by_their_own_names(tmp_path, monkeypatch):
+    run = write_run(tmp_path / "runs", "bgpo", 9)
+    (write_run(tmp_path / "runs", "oracle", 5) / "eval.csv").unlink()
+    report(ReportArguments((tmp_path / "runs",), archive=tmp_path / "archive"))
+    assert [path.name for path in (tmp_path / "archive").glob("*/")] == [run.name]
+    monkeypatch.chdir(run)
+    report(ReportArguments((Path(),), archive=tmp_path / "alone"))
+    assert [path.name for path in (tmp_path / "alone").glob("*/")] == [run.name]

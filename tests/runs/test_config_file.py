@@ -20,7 +20,7 @@ def write(path, config, **changes):
 def test_settings_are_read_as_they_were_written(tmp_path):
     for name, entry in ALGORITHMS.items():
         rl = replace(entry.config.rl, hidden_sizes=(5, 7), gamma=0.5)
-        algorithm = replace(entry.config, state="state", rl=rl)
+        algorithm = replace(entry.config, state_limit=4.0, rl=rl)
         config = replace(PRESETS["quick"], name=name, algorithm=algorithm, checkpoint_minutes=3)
         read, digests = read_config(write(tmp_path / "config.json", config))
         assert (read, digests) == (config, Digests(encoders="abc", bank="def"))
