@@ -110,8 +110,8 @@ def _phases(run: Run) -> tuple[list[int], int]:
 def success_matrix(run: Run) -> Values:
     """Return ``R[i, j]``, the success on task j at the end of phase i, ``[S, T, T]``.
 
-    Success is the mean over the last fifth of a phase, at least one evaluation; NaN for tasks that
-    have not been presented.
+    Success is the mean over as many evaluations as the last fifth of the shortest phase has, at
+    least one; NaN for tasks that have not been presented.
 
     Raises:
         ValueError: If tasks do not start one after the other, or a phase has no test of its task.

@@ -151,8 +151,8 @@ def sequence_section(setting: Setting, reference: Setting | None) -> Section:
         rows.append([name, forgotten, forward.points() if forward else "-"])
     notes = (
         "Means over seeds and 95 % intervals, in points. Forgetting: mean over tasks of R[j, j] "
-        "minus R at the end. R[i, j] is the success on task j over the last fifth of the phase of "
-        "task i.",
+        "minus R at the end. R[i, j] is the success on task j at the end of the phase of "
+        "task i, over as many tests as the last fifth of the shortest phase has.",
         "Forward transfer: (area - reference) / (1 - reference), areas under a task's curve over "
         "its own episodes, from the first to the last test of its phase; reference: the same "
         "algorithm with all tasks from the start, whose seeds count in the interval.",
