@@ -4,13 +4,14 @@ Records demonstrations, trains encoders on them, learns with each algorithm, and
 The same command resumes whatever was interrupted. Run it in the folder of the repository:
 
     python benchmarks/continual_world.py
-    python benchmarks/continual_world.py --small
+    python benchmarks/continual_world.py --small --folder runs/cw10-small
 
 docs/benchmark.md says what is different from Continual World.
 """
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from bgpo_trl.experiments.command_line import import_plugin
 from bgpo_trl.experiments.report import report
 from bgpo_trl.experiments.run import run_experiment
 from bgpo_trl.experiments.settings import run_config
+from bgpo_trl.files.writing import write_json
 from bgpo_trl.machine import set_threads
 from bgpo_trl.scenes import find_scene
 
@@ -54,9 +56,19 @@ def make_encoders(
 
     Returns:
         The files of the encoders and of the bank of all tasks.
+
+    Raises:
+        ValueError: If the folder has encoders of other settings.
     """
     weights, bank = folder / "encoders.safetensors", folder / "bank.safetensors"
+    record, steps = folder / "encoders.json", config.vae.steps
+    made = {"demonstrations": demonstrations, "encoder_tasks": encoder_tasks, "vae_steps": steps}
     if bank.exists():
+        # Those of the archive come without a record.
+        if record.exists() and (found := json.loads(record.read_text())) != made:
+            raise ValueError(
+                f"{folder} has encoders of {found}, asked for are {made}: choose another --folder"
+            )
         return weights, bank
     tasks = find_scene(SCENE).default_tasks
     dataset = record_demonstrations(
@@ -69,6 +81,7 @@ def make_encoders(
     encoders, _ = train_encoders(
         seen, None, weights, folder / "encoders", config, tasks=known, scene=SCENE
     )
+    write_json(record, made)
     make_bank(encoders, dataset, tasks=tasks).save(bank)
     return weights, bank
 

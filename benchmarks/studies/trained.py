@@ -122,7 +122,8 @@ def trained(arguments: WeightsArguments) -> str:
 
     Prints a table of success (%) and steps of a success, means over seeds, and in points what the
     policy of the tests has above the clone, paired by seed; writes trained.csv and trained.json
-    (commit and command) into the run directory.
+    (commit and command) into the run directory, of the latest weights trained-latest.csv and
+    trained-latest.json.
 
     Raises:
         ValueError: If the run cannot be loaded.
@@ -139,7 +140,7 @@ def trained(arguments: WeightsArguments) -> str:
         with progress_bar("trained", total=steps, unit="step") as bar:
             rows += measure_trained(run, arguments.episodes, bar.update)
     table = pd.DataFrame(rows)
-    write_measurement(out, "trained", table, commit)
+    write_measurement(out, "trained-latest" if arguments.latest else "trained", table, commit)
     return summarized(table)
 
 

@@ -39,7 +39,8 @@ def run_config(
     given = {name: value for name, value in (changes or {}).items() if value is not None}
     config = replace(config, **given)
     if arguments.settings:
-        config = tyro.cli(SETTINGS, default=config, args=arguments.settings)
+        program = f"bgpo {'concurrent' if from_start else 'continual'}"
+        config = tyro.cli(SETTINGS, prog=program, default=config, args=arguments.settings)
     if from_start:
         if arguments.add_task is not None:
             raise ValueError("--add-task: a task that comes later is for `bgpo continual`")

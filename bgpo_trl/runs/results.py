@@ -270,6 +270,11 @@ def read_run(directory: str | os.PathLike[str]) -> Run:
             f"{directory / 'config.json'} does not say when each task starts: put it back as the "
             "run left it"
         )
+    seeds = config["seeds"]
+    if not all(type(seed) is int for seed in seeds) or len({*seeds}) < len(seeds):
+        raise ValueError(
+            f"{directory / 'config.json'} has the seeds {seeds}: name whole numbers, each once"
+        )
     path = directory / "summary.json"
     lists: dict[str, Any] = dict.fromkeys(_OF_SEEDS, list | None)
     maps: dict[str, Any] = dict.fromkeys(("changed", "demonstrated_steps"), dict | None)
