@@ -9,7 +9,6 @@ from timing import Timing, interleave, ratio
 
 from benchmarks.speed import gwr, updates
 from benchmarks.speed.updates import BATCH, Floor, Ours, contenders, floor_batch
-from benchmarks.speed.versions import Training
 
 
 def weights(ours: Ours) -> list[torch.Tensor]:
@@ -41,18 +40,6 @@ def test_every_contender_makes_its_updates():
     for call, count in found.values():
         assert count > 0
         call()
-
-
-@pytest.mark.slow
-def test_a_step_by_which_versions_are_compared_is_the_sum_of_its_parts_and_trains():
-    training = Training(seeds=1, experts=2, rows=16)
-    loss = training.algorithm.experts.learner.loss
-    before = [parameter.clone() for parameter in loss.parameters()]
-    assert {len(parameter[0]) for parameter in before} == {2}
-    *parts, whole = training.time(1)
-    assert min(parts) > 0 and sum(parts) == pytest.approx(whole)
-    for parameter, start in zip(loss.parameters(), before, strict=True):
-        assert parameter.ne(start).flatten(2).any(-1)[0, 0].all()
 
 
 def test_contenders_take_turns_and_only_rounds_after_the_warmup_count():
