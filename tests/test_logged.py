@@ -174,7 +174,7 @@ def test_seeds_alone_equal_seeds_of_a_batch(begin, logged_config, log, tmp_path)
         torch.testing.assert_close(value, second[key], rtol=0, atol=1e-5)
 
 
-GROUND_TRUTH = {"algorithm": {"state": "state", "demonstration_share": 0.0}}
+GROUND_TRUTH = {"algorithm": {"state": "state", "beta": 0.0, "demonstration_share": 0.0}}
 GROUND_TRUTH |= {"rl": {"proposals": "actor", "imitation": 0.0}}
 DOT = {"left": [episode(2, success=True, shape=(16, 24), size=1)]}
 

@@ -315,7 +315,10 @@ def cut_checkpoints(run):
         (lambda run: rewrite(run, encoders="0" * 64), "trained with the encoders 000000000000"),
         (lambda run: rewrite(run, bank="0" * 64), "with the demonstrations 000000000000"),
         (lambda run: rewrite(run, encoders=None), "trained without encoders"),
-        (lambda run: rewrite_algorithm(run, state="state"), "state is latent there and state here"),
+        (
+            lambda run: rewrite_algorithm(run, state="state", beta=0.0),
+            "state is latent there and state here",
+        ),
         (lambda run: rewrite_algorithm(run, {"hidden_sizes": [2_000_000_000]}), "hidden_sizes is"),
         (lambda run: rewrite(run, name="mine"), "'mine'"),
     ],

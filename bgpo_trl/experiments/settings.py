@@ -29,7 +29,9 @@ def run_config(
     config, name = _begin(arguments), arguments.algorithm
     scene = find_scene(arguments.scene or config.scene)
     if name is not None and name != config.name:
-        config = replace(config, name=name, algorithm=_fitting(entry(name).config, scene))
+        config = replace(config, name=name, algorithm=entry(name).config)
+        if scene.name != PRESETS["quick"].scene:  # which the usual hyperparameters are for
+            config = replace(config, algorithm=_fitting(config.algorithm, scene))
     if scene.name != config.scene:
         config = _in_scene(config, scene)
     if arguments.tasks is not None:
