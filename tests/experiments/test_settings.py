@@ -91,6 +91,7 @@ def test_a_file_changes_the_preset_and_flags_change_the_file(tmp_path):
     flags = replace(of_file, settings=("--algorithm.beta", "0.7", "--eval-every=9"))
     changed = replace(expected, eval_every=9, algorithm=replace(algorithm, beta=0.7))
     assert run_config(flags) == changed
+    assert run_config(replace(of_file, algorithm="bgpo-single")) == expected  # named once more
     other = run_config(replace(of_file, algorithm="maml"))
     assert (other.name, other.algorithm) == ("maml", ALGORITHMS["maml"].config)
 
@@ -108,6 +109,9 @@ def test_a_file_may_name_the_scene_whose_tasks_and_length_are_then_the_usual_one
         assert of_file == of_flag
         assert (of_file.scene, of_file.algorithm.max_steps) == ("dot", length)
         assert of_file.tasks == SCENES["dot"].default_tasks
+        path.write_text(f"scene: dot\n{content}")
+        other = run_config(Arguments(config=path, algorithm="clone")).algorithm
+        assert other == replace(ALGORITHMS["clone"].config, max_steps=12)
 
 
 def test_a_file_sets_what_encoders_train_with_and_flags_change_the_file(tmp_path):
