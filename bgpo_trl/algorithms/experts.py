@@ -99,9 +99,10 @@ class Experts:
     The learner's networks are a stack ``[S, E]``, those of the active groups: ``E`` follows their
     number, so that an update costs as much as groups are active. When a group rests, its expert
     (networks, targets, moments) is put aside until the group is played again, and does not
-    change until then. A new group starts from its parent's networks, and
-    imitates as at first. It has no moments of Adam, whose count of steps is common, so that its
-    first steps are up to three times as long as a new optimizer's (no harm: docs/learning.md).
+    change until then. A new group starts from its parent's networks, without moments, and
+    imitates as at first. As Adam counts the steps of all experts together, the first steps of a new
+    one are up to three times as long as a new optimizer's; the parent's second moments gained
+    nothing (docs/learning.md, "Tried without success").
 
     Args:
         learner: The learner, of one expert per seed.

@@ -155,11 +155,13 @@ def _setting(runs: list[Run]) -> Setting:
     )
     for run in runs[1:]:
         check_conditions(runs[0], run)
+    places: dict[str, list[Path]] = {}
+    for run in runs:
+        places.setdefault(title_of(run), []).append(run.place.resolve())
     named: dict[str, Run] = {}
     for run in runs:
         title = title_of(run)
-        alike = [str(other.place.resolve()) for other in runs if title_of(other) == title]
-        if len(alike) > 1:
+        if len(alike := places[title]) > 1:
             within = run.place.resolve().relative_to(os.path.commonpath(alike))
             title += f" ({run.place.name if within == Path() else within})"
         if title in named:

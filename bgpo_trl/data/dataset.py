@@ -58,13 +58,12 @@ def open_complete(path: Path) -> tuple[TensorDict, dict[str, Any]]:
                 f"{path} was recorded in scene {meta['scene_version']!r}, this is "
                 f"{scene.full_version}; {_REMEDY}"
             )
-        stored = [key for key in NUMBERS if meta.get(f"{key.removesuffix('s')}_size")]
-        known = layout_of(scene, stored, meta["max_steps"])
-        for key in ("frame_shape", *(f"{name.removesuffix('s')}_size" for name in stored)):
-            if meta[key] != known.get(key, 0):
+        known = layout_of(scene, NUMBERS, meta["max_steps"])
+        for key in ("frame_shape", "action_size", "state_size", "joint_size"):
+            found, needed = meta.get(key), known.get(key, 0)
+            if found and found != needed:  # 0 numbers are those that are not stored
                 raise ValueError(
-                    f"{path} has the {key} {meta[key]}, the scene {scene.name!r} "
-                    f"{known.get(key, 0)}; {_REMEDY}"
+                    f"{path} has the {key} {found}, the scene {scene.name!r} {needed}; {_REMEDY}"
                 )
     if not meta.get("checksum"):
         raise ValueError(

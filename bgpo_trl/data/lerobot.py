@@ -70,7 +70,8 @@ def read_lerobot(
             they stay as they are.
         episodes: Numbers of the episodes to read; None: all.
         tasks: Descriptions of the tasks to read; None: all.
-        stride: Read every so many-th frame: 3 turns 30 frames a second into 10.
+        stride: Read every so many-th frame, the last one among them, which shows the success: 3
+            turns 30 frames a second into 10.
         combine: With a stride, function from the actions between two frames that are read,
             ``[stride, A]``, to one action ``[A]``, such as their sum if they are displacements,
             or the last if they are targets.
@@ -351,7 +352,6 @@ class _Reader:
                 "have to follow each other evenly"
             )
         n_read, first_read = (len(rows) - 1) // stride + 1, (len(rows) - 1) % stride
-        # The last frame is read in any case, since it shows the success.
         frames = self._frames(rows[first_read::stride], times[first_read::stride], place)
         if self.frame_shape is not None:
             frames = (resize_frames(frame[None], self.frame_shape)[0] for frame in frames)

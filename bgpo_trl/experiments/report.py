@@ -111,11 +111,11 @@ def report(arguments: ReportArguments) -> str:
         found, _ = read_settings(directories)  # Refuses before copying.
         runs = [run for setting in found for run in setting.runs.values()]
         finished = {directory for run in runs for directory in run.directories}
-        targets = [*zip(directories, copies, strict=True)]
-        directories = [copy for directory, copy in targets if directory in finished]
-        for directory, copy in targets:
-            if directory in finished:
-                archive_run(directory, copy)
+        pairs = zip(directories, copies, strict=True)
+        targets = {directory: copy for directory, copy in pairs if directory in finished}
+        for directory, copy in targets.items():
+            archive_run(directory, copy)
+        directories = [*targets.values()]
     settings, left_out = read_settings(directories)
     sections = [Section("Left out", notes=[left_out])] if left_out else []
     for setting in settings:
@@ -126,8 +126,6 @@ def report(arguments: ReportArguments) -> str:
 def _names_in(folder: Path) -> list[Path]:
     """Return the paths of the runs in a folder, relative to it; of a run, its name."""
     runs = run_directories([folder])
-    return (
-        [Path(folder.resolve().name)]
-        if runs == [folder]
-        else [run.relative_to(folder) for run in runs]
-    )
+    if runs == [folder]:
+        return [Path(folder.resolve().name)]
+    return [run.relative_to(folder) for run in runs]
