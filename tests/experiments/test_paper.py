@@ -18,6 +18,7 @@ import pytest
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis.comparison import NAMES
 from bgpo_trl.configs import RepresentationConfig
+from bgpo_trl.experiments import measure
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.experiments.measure import success_lines
@@ -298,7 +299,33 @@ def test_a_task_is_added_to_a_finished_run_and_reported(undrawn, tmp_path, encod
     assert set(tests["task"]) == {*TASKS, "lift_green"}
     assert json_of(run, "config")["tasks"] == [*TASKS, "lift_green"]
     assert json_of(run, "config")["task_starts"][-1] > 6
-    assert "is finished, all 16 episodes" in continual(Arguments(out=run, resume=True))
+    for again in (command, Arguments(out=run, resume=True)):
+        assert "is finished, all 16 episodes" in continual(again)
+
+
+def test_a_policy_of_the_ground_truth_needs_no_frames(tiniest, tmp_path):
+    run, settings = tmp_path / "run", ("--algorithm.state", "state")
+    continual(Arguments(algorithm="without-bonus", out=run, settings=settings))
+    assert json_of(run, "config")["algorithm"]["state"] == "state"
+    assert json_of(run, "summary")["episodes"] == 6
+    figures = {path.name for path in (run / "figures").iterdir()}
+    assert "success.png" in figures
+    assert not figures & {"episodes.png", *(f"{task}.gif" for task in TASKS)}
+
+
+def test_seen_tests_show_only_demonstrations_of_training(tiniest, tmp_path, monkeypatch):
+    run, shown = tmp_path / "run", []
+
+    class Recording(measure.Evaluator):
+        def __init__(self, config, bank, *rest, **options):
+            shown.append(bank)
+            super().__init__(config, bank, *rest, **options)
+
+    monkeypatch.setattr(measure, "Evaluator", Recording)
+    continual(Arguments(out=run, settings=("--demonstrations", "1")))
+    seen, held_out, *_ = shown
+    assert seen.task.tolist() == [0, 1, 2]  # one demonstration of each task
+    assert len(held_out.task) > 3
 
 
 def test_a_run_says_what_it_reached_and_in_how_many_steps():
