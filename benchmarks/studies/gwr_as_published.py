@@ -27,6 +27,7 @@ from bgpo_trl.analysis.task_inference import majority_task, match_counts, task_i
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.figures.gwr import plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.writing import make_folder
@@ -154,4 +155,4 @@ def study(arguments: Arguments) -> str:
 
 
 if __name__ == "__main__":
-    print(study(tyro.cli(Arguments)))
+    command_line(study)

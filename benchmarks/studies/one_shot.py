@@ -79,7 +79,7 @@ def show(
     inferred, activity = torch.full((2, n_seeds, n_tasks), torch.nan, dtype=torch.double)
     if algorithm.gwr is not None:
         activity = algorithm.gwr.lookup(embedding.expand(n_seeds, *embedding.shape)).activity
-        activity, seen = activity.mean(-1).double(), policy.bank.seen()
+        activity, seen = activity.mean(-1).double(), policy.bank.seen(policy.config.demonstrations)
         for number, (phi, label) in enumerate(zip(embedding, task, strict=True)):
             tested = DemonstrationBank(
                 phi, label, torch.zeros_like(label, dtype=torch.bool), policy.tasks

@@ -19,14 +19,12 @@ the mean return.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import torch
-import tyro
 from scipy.stats import mannwhitneyu
 from tensordict import TensorDict
 from torch import Tensor
@@ -39,6 +37,7 @@ from bgpo_trl.configs import SHOWN, BGPOConfig, RLConfig
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
 from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.scenes import find_scene
 from bgpo_trl.seeding import generators, normal, stream_seed
 
@@ -288,10 +287,9 @@ class Trial:
         return row
 
 
-def main() -> None:
+def one_task(arguments: Arguments) -> None:
     """Run a trial."""
     torch.set_num_threads(1)
-    arguments = tyro.cli(Arguments, description=__doc__)
     trial = Trial(arguments)
     if arguments.rl.proposals != "actor":
         trial.imitate()
@@ -308,4 +306,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command_line(one_task)

@@ -1,9 +1,9 @@
 """The claims of the paper are tested on the rows of its unfinished runs.
 
-Protocols 2 to 4 of docs/protocol.md: the rows count up to the largest number of episodes that all
+Protocols 2 to 7 of docs/protocol.md: the rows count up to the largest number of episodes that all
 runs have reached; a seed's score is the success of its tests in the last fifth of them, its area
 the mean over all its evaluations of the success of the tasks presented by then. Runs of one arm are
-in folders of one name, with the seed after it.
+in folders of one name, with the seeds after it.
 
     python benchmarks/studies/paper_claims.py benchmarks/results/paper-quarter
 """
@@ -58,7 +58,7 @@ def runs_of(folder: Path) -> tuple[dict[str, Run], int]:
         replace(run, tests=run.tests[run.tests.episode <= reached], training=rows)
         for run, rows in zip(read, (r[r.episode <= reached] for r in played), strict=True)
     ]
-    runs = {re.sub(r"-\d+$", "", run.directories[0].name): run for run in joined(cut)}
+    runs = {re.sub(r"(-\d+)+$", "", run.directories[0].name): run for run in joined(cut)}
     if sum(len(run.directories) for run in runs.values()) < len(cut):
         raise ValueError(f"{folder} has runs of an arm with other settings: keep one setting")
     return runs, reached

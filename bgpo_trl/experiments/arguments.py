@@ -57,12 +57,12 @@ class Arguments(BankArguments):
     """
 
     algorithm: str | None = None
-    """bgpo, the default; bgpo-experts: without demonstrations as experience; bgpo-single: without
-    experts too; maml and dist-nll: the baselines; bgpo-paper, maml-paper, dist-nll-paper: as
-    published; oracle and ddpg: DDPG with the task label as context, and without context;
-    fine-tuning and ewc: DDPG without context that is given task boundaries, best with --schedule
-    sequential; maml, dist-nll, oracle, fine-tuning or ewc followed by -demonstrations: with
-    demonstrations as experience. Ablations (Fig. 9): without-bonus, without-gwr, without-both:
+    """bgpo, the default; clone: without reward; bgpo-experts: without demonstrations as experience;
+    bgpo-single: without experts too; maml and dist-nll: the baselines; bgpo-paper, maml-paper,
+    dist-nll-paper: as published; oracle and ddpg: DDPG with the task label as context, and without
+    context; fine-tuning and ewc: DDPG without context that is given task boundaries, best with
+    --schedule sequential; maml, dist-nll, oracle, fine-tuning or ewc followed by -demonstrations:
+    with demonstrations as experience. Ablations (Fig. 9): without-bonus, without-gwr, without-both:
     bgpo-single without the intrinsic reward, GWR-B or both; group-balanced-replay, demonstrations:
     bgpo-single with that addition. Or one that the module of --import adds."""
     preset: Literal["smoke", "quick", "desk", "paper"] | None = None
@@ -256,7 +256,8 @@ class SweepArguments(BankArguments):
 class DoctorArguments(ImportArguments):
     """Check this machine and installation, a line for each check.
 
-    A line begins with ok, or with wrong for unusable, with which the exit status is 1.
+    A line begins with ok, with look for what to look into, or with wrong for unusable, with which
+    the exit status is 1.
     """
 
     frame: Path | None = None

@@ -54,6 +54,9 @@ def command_line(
             arguments = _parse(asked, options, program, line)
             import_plugin(getattr(arguments, "module", None))
             text = command(arguments)
+    except BrokenPipeError:  # as by `| head`, which has read enough; the exit flushes once more
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         if _is_of_others(error):
             raise

@@ -5,6 +5,7 @@ import json
 import os
 import runpy
 import signal
+import subprocess
 import sys
 import warnings
 from pathlib import Path
@@ -210,3 +211,9 @@ def test_an_error_of_own_code_keeps_its_traceback_unless_it_misuses_the_package(
             command_line(command, [])
     with pytest.raises(SystemExit, match=r"^error: beta must be at least 0"):
         command_line(misuse, [])
+
+
+def test_a_reader_that_has_read_enough_is_no_error():
+    line = f"{sys.executable} -m bgpo_trl continual --help | head -1"
+    run = subprocess.run(line, shell=True, capture_output=True, text=True, check=True)
+    assert (run.stdout, run.stderr) == ("usage: bgpo continual [-h] [OPTIONS]\n", "")
