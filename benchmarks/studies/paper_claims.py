@@ -11,7 +11,6 @@ in folders of one name, with the seeds after it.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -35,21 +34,20 @@ N_RANDOM = 300
 
 @dataclass(frozen=True)
 class ClaimsArguments:
-    """Runs of equal conditions, of as many arms and seeds as there are."""
+    """Runs of equal conditions in one folder, of as many arms and seeds as there are."""
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Folders of runs, or single runs; ``claims.md`` and ``claims.png`` are written to the
-    first."""
+    runs: Annotated[Path, tyro.conf.Positional]
+    """Folder of the runs; ``claims.md`` and ``claims.png`` are written to it."""
 
 
-def runs_of(folders: Sequence[Path]) -> tuple[dict[str, Run], int]:
+def runs_of(folder: Path) -> tuple[dict[str, Run], int]:
     """Return the runs by arm, up to the episode that all have reached, and this episode.
 
     Raises:
         ValueError: If there is no run, one is damaged or without training episodes, conditions
             differ, or runs of an arm cannot be joined.
     """
-    read = [read_run(directory) for directory in run_directories(folders)]
+    read = [read_run(directory) for directory in run_directories([folder])]
     for run in read:
         check_conditions(read[0], run, ["episodes"])
         if run.training is None or run.training.empty:
@@ -62,7 +60,7 @@ def runs_of(folders: Sequence[Path]) -> tuple[dict[str, Run], int]:
     ]
     runs = {re.sub(r"(-\d+)+$", "", run.directories[0].name): run for run in joined(cut)}
     if sum(len(run.directories) for run in runs.values()) < len(cut):
-        raise ValueError(f"{folders[0]} has runs of an arm with other settings: keep one setting")
+        raise ValueError(f"{folder} has runs of an arm with other settings: keep one setting")
     return runs, reached
 
 
@@ -72,8 +70,8 @@ def paper_claims(arguments: ClaimsArguments) -> str:
     Raises:
         ValueError: See `runs_of`.
     """
-    folder = arguments.runs[0]
-    runs, reached = runs_of(arguments.runs)
+    folder = arguments.runs
+    runs, reached = runs_of(folder)
     first = next(iter(runs.values()))
     spread = first.config["spread"]
     chance = evaluate_random_policy(tasks=first.tasks, episodes=N_RANDOM, seed=0, spread=spread)

@@ -51,12 +51,13 @@ def command_line(
     resumable = hasattr(asked, "resume")
     try:
         with _terminable() if resumable else contextlib.nullcontext(), _plain_warnings():
-            arguments = _parse(asked, options, program, line)
+            try:
+                arguments = _parse(asked, options, program, line)
+            except BrokenPipeError:  # of --help, by `| head`; the exit flushes once more
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                sys.exit(1)
             import_plugin(getattr(arguments, "module", None))
             text = command(arguments)
-    except BrokenPipeError:  # as by `| head`, which has read enough; the exit flushes once more
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         if _is_of_others(error):
             raise

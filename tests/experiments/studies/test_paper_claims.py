@@ -47,7 +47,7 @@ def test_rows_count_up_to_the_episode_that_all_runs_have_reached(tmp_path, monke
     for seed, episodes in enumerate((100, 200)):
         write(tmp_path, "slow", seed, episodes, 0.2)
         write(tmp_path, "fast", seed, episodes, 0.8 + 0.2 * seed)
-    text = paper_claims.paper_claims(ClaimsArguments((tmp_path,)))
+    text = paper_claims.paper_claims(ClaimsArguments(tmp_path))
     assert text == (tmp_path / "claims.md").read_text()
     assert (tmp_path / "claims.png").exists()
     scores, contrasts = text.split("\n\n")[1:3]
@@ -64,12 +64,12 @@ def test_arms_of_one_algorithm_are_told_apart_by_their_folders(tmp_path):
         write(tmp_path, arm, 0, 100, 0.5)
         changed = {"name": "slow", "algorithm": settings, "episodes": len(arm)}
         edit(tmp_path / f"{arm}-0" / "config.json", **changed)
-    runs, reached = paper_claims.runs_of([tmp_path])
+    runs, reached = paper_claims.runs_of(tmp_path)
     assert [*runs] == ["slow", "without-bonus"]
     assert reached == 100
     write(tmp_path, "slow", 1, 100, 0.5)
     with pytest.raises(ValueError, match="an arm with other settings"):
-        paper_claims.runs_of([tmp_path])
+        paper_claims.runs_of(tmp_path)
 
 
 def test_a_task_counts_in_the_area_from_when_it_is_presented(tmp_path, monkeypatch):
@@ -81,7 +81,7 @@ def test_a_task_counts_in_the_area_from_when_it_is_presented(tmp_path, monkeypat
     tests = tests[(tests.task == TASKS[0]) | (tests.episode >= 90)]
     tests["success"] = (tests.episode < 90).astype(int)
     tests.to_csv(path, index=False)
-    text = paper_claims.paper_claims(ClaimsArguments((tmp_path,)))
+    text = paper_claims.paper_claims(ClaimsArguments(tmp_path))
     row = next(row for row in cells(text.split("\n\n")[1]) if row[0] == "slow")
     assert row[3] == "80.0"
 
@@ -91,4 +91,4 @@ def test_runs_of_other_conditions_are_refused(tmp_path):
     write(tmp_path, "fast", 0, 20, 0.5)
     edit(tmp_path / "fast-0" / "config.json", spread=1.0)
     with pytest.raises(ValueError, match="differ in spread"):
-        paper_claims.paper_claims(ClaimsArguments((tmp_path,)))
+        paper_claims.paper_claims(ClaimsArguments(tmp_path))
