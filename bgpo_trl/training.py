@@ -193,13 +193,7 @@ class Trainer:
             device=device,
             scene=self._scene,
         )
-        self.world = World(
-            self.algorithm,
-            seeds=config.seeds,
-            schedule=self._schedule,
-            bank=seen,
-            spread=config.spread,
-        )
+        self.world = World(self.algorithm, schedule=self._schedule, spread=config.spread)
         self.evaluator: Evaluator | None = None
         if config.eval_episodes:
             tested = bank.held_out(config.held_out)

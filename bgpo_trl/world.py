@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torchrl.envs import EnvBase
 
 from bgpo_trl.algorithms import Algorithm
-from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.seeding import generators, stream_seed
 from bgpo_trl.transforms import DemonstrationSource, TaskSchedule
 
 
 class World:
-    """Simulations of a batch of seeds, within the transforms of an algorithm.
+    """Simulations of an algorithm's seeds, within its transforms.
+
+    Episodes show the demonstrations of its bank.
 
     Args:
         algorithm: The algorithm, which makes the environment.
-        seeds: One for each element of the batch.
         schedule: Times at which tasks are presented.
-        bank: Embedded demonstrations for training episodes.
         spread: Share of the whole range of start states.
 
     Raises:
@@ -35,14 +33,9 @@ class World:
     """
 
     def __init__(
-        self,
-        algorithm: Algorithm,
-        *,
-        seeds: Sequence[int],
-        schedule: TaskSchedule,
-        bank: DemonstrationBank,
-        spread: float = 1.0,
+        self, algorithm: Algorithm, *, schedule: TaskSchedule, spread: float = 1.0
     ) -> None:
+        bank, seeds = algorithm.bank, algorithm.seeds
         batch = torch.Size([len(seeds)])
         self.source = DemonstrationSource(
             bank, schedule, batch_size=batch, generator=generators(seeds, "demonstrations")

@@ -125,11 +125,11 @@ def make_config():
 
 
 @pytest.fixture
-def in_world(bank):
+def in_world():
     """Give an algorithm a `World`, its attribute ``world``."""
 
-    def enter(algorithm, seeds, schedule, bank=bank):
-        algorithm.world = World(algorithm, seeds=seeds, schedule=schedule, bank=bank.seen())
+    def enter(algorithm, schedule):
+        algorithm.world = World(algorithm, schedule=schedule)
         return algorithm
 
     return enter

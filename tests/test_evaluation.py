@@ -37,7 +37,7 @@ def make(bank, encoders, make_config, in_world):
         algorithm = entry(name).make(
             config.algorithm, seeds=SEEDS, bank=bank.seen(), encoders=encoders
         )
-        in_world(algorithm, SEEDS, TaskSchedule(starts))
+        in_world(algorithm, TaskSchedule(starts))
         evaluator = Evaluator(config, bank.held_out(), encoders, episodes=episodes, starts=starts)
         # Four episodes, after which all tasks are presented, take at most 24 steps.
         n_usual = next((n for start, n in STEPS.items() if name.startswith(start)), 25)

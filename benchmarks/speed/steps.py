@@ -114,7 +114,7 @@ def main(arguments: Arguments) -> None:
         algorithm = known.make(
             known.config, seeds=seeds, bank=seen, encoders=encoders, device=place
         )
-        world = World(algorithm, seeds=seeds, schedule=TaskSchedule((0,) * n_tasks), bank=seen)
+        world = World(algorithm, schedule=TaskSchedule((0,) * n_tasks))
         key = f"{name}, {n_tasks} tasks, {device}"
         running[key] = Steps(algorithm, world)
         running[key].play(arguments.played)

@@ -106,8 +106,7 @@ class Training(Steps):
     def __init__(self, seeds: range) -> None:
         encoders, bank = load_pretrained()
         algorithm = BGPO(BGPOConfig(), seeds=seeds, bank=bank.seen(), encoders=encoders)
-        schedule = TaskSchedule((0, 0, 0))
-        self.world = World(algorithm, seeds=seeds, schedule=schedule, bank=bank.seen())
+        self.world = World(algorithm, schedule=TaskSchedule((0, 0, 0)))
         super().__init__(algorithm, self.world)
         self.play(algorithm.config.rl.warmup_steps + 1)
 

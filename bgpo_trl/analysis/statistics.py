@@ -9,6 +9,7 @@ in points (0 to 100).
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -56,20 +57,17 @@ def contrast(
     Raises:
         ValueError: If a sample is empty, not finite or not a vector.
     """
-    value, variances, freedoms = 0.0, [], []
-    for sign, scores in ((1.0, sample), *(() if minus is None else ((-1.0, minus),))):
-        checked = _checked(scores)
-        value += sign * checked.mean()
-        # The variance of a single score is unknown.
-        variances.append(checked.var(ddof=1) / len(checked) if len(checked) > 1 else math.nan)
-        freedoms.append(len(checked) - 1)
-    error = math.sqrt(sum(variances))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shares = np.square(variances) / freedoms
-        freedom = float(np.float64(sum(variances)) ** 2 / shares.sum())
-    # Without any spread, the degrees of freedom are 0 / 0 and the interval is a point.
-    half = error and error * float(stats.t.ppf((1 + confidence) / 2, freedom))
-    return Estimate(float(value), float(value) - half, float(value) + half)
+    first = _checked(sample)
+    second = None if minus is None else _checked(minus)
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")  # A single score has no variance, equal ones have none.
+        if second is None:
+            value, test = first.mean(), stats.ttest_1samp(first, 0.0)
+        else:
+            value = first.mean() - second.mean()
+            test = stats.ttest_ind(first, second, equal_var=False)
+        low, high = test.confidence_interval(confidence)
+    return Estimate(float(value), float(low), float(high))
 
 
 def mean(scores: ArrayLike) -> Estimate:

@@ -90,9 +90,10 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
         loggers.append(partial(tensorboard_logger, out))
     if added is not None:
         grown = add_task(out, added, config=config, bank=arguments.bank)
-        config, seen = grown.config, distinctness(grown.bank)
-        verdict = f"{added}: {seen}"
-        if not seen.clear:
+        config = grown.config
+        clear, line = distinctness(grown.bank)
+        verdict = f"{added}: {line}"
+        if not clear:
             warnings.warn(verdict, stacklevel=2)
     with lock_directory(out):
         if grown is None:

@@ -77,43 +77,14 @@ def add_task(
     return Grown(grown, encoders, shown)
 
 
-class Distinctness(NamedTuple):
-    """How well embeddings tell the last task of a bank from the others.
+def distinctness(bank: DemonstrationBank) -> tuple[bool, str]:
+    """Measure how well embeddings tell the last of a bank's two or more tasks from the others.
 
-    Attributes:
-        new: Share of its demonstrations whose nearest other demonstration is of the same task.
-        old: The same of the other tasks, before it was added.
-        confused: The task that most of the mistaken demonstrations are nearest to; None without
-            such ones.
-    """
+    At most 300 demonstrations of each task are compared with their nearest other demonstration.
 
-    new: float
-    old: float
-    confused: str | None
-
-    @property
-    def clear(self) -> bool:
-        """Whether the last task is told apart about as well as the others."""
-        return self.new >= self.old - _CONFUSED
-
-    def __str__(self) -> str:
-        """Return the measurements and the verdict in a line."""
-        verdict = (
-            "the encoders tell the new task from the others"
-            if self.clear
-            else f"the encoders confuse the new task with {self.confused}: a new run with encoders "
-            "that are trained on it too (bgpo encoders) would learn it better"
-        )
-        return (
-            f"nearest demonstration of the same task: {self.new:.0%} of the new demonstrations, "
-            f"{self.old:.0%} of the old; {verdict}"
-        )
-
-
-def distinctness(bank: DemonstrationBank) -> Distinctness:
-    """Measure whether encoders see the last of a bank's two or more tasks.
-
-    At most 300 demonstrations of each are compared.
+    Returns:
+        Whether the last task is told apart about as well as the others were without it, and a line
+        with the measurements and the verdict.
     """
     last = len(bank.tasks) - 1
     rows = torch.cat([torch.nonzero(bank.task == t).flatten()[:_MOST] for t in range(last + 1)])
@@ -122,10 +93,18 @@ def distinctness(bank: DemonstrationBank) -> Distinctness:
     is_new = task == last
     nearest = task[distance.argmin(1)]
     nearest_old = task[distance.masked_fill(is_new, torch.inf).argmin(1)]
-    mistaken = nearest[is_new & (nearest != task)]
+    new = float((nearest == task)[is_new].float().mean())
     # With one old task, no old demonstration could have been mistaken.
-    return Distinctness(
-        new=float((nearest == task)[is_new].float().mean()),
-        old=float((nearest_old == task)[~is_new].float().mean()),
-        confused=bank.tasks[int(mistaken.mode().values)] if len(mistaken) else None,
+    old = float((nearest_old == task)[~is_new].float().mean())
+    clear = new >= old - _CONFUSED
+    verdict = "the encoders tell the new task from the others"
+    if not clear:
+        confused = bank.tasks[int(nearest[is_new & (nearest != task)].mode().values)]
+        verdict = (
+            f"the encoders confuse the new task with {confused}: a new run with encoders that are "
+            "trained on it too (bgpo encoders) would learn it better"
+        )
+    return clear, (
+        f"nearest demonstration of the same task: {new:.0%} of the new demonstrations, {old:.0%} "
+        f"of the old; {verdict}"
     )

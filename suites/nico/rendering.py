@@ -185,18 +185,6 @@ class FrameRenderer:
             finally:
                 _leave()
 
-    def driver(self) -> str:
-        """Return OpenGL's name of the renderer, such as ``"llvmpipe (LLVM 15.0.6)"``."""
-        from OpenGL import GL
-
-        with _turn:
-            self._renderer.render()  # Makes the context current.
-            try:
-                name = GL.glGetString(GL.GL_RENDERER)
-            finally:
-                _leave()
-        return name.decode() if isinstance(name, bytes) else "unknown"
-
     def close(self) -> None:
         """Free the OpenGL context."""
         _close(self._renderer)

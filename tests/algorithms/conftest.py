@@ -33,7 +33,7 @@ def make_bgpo(bank, encoders, make_config, in_world):
                 shown = (seed + row) % len(bank.seen().task)
                 start = None if algorithm.starts is None else algorithm.starts[shown]
                 groups.adapt(bank.seen().embedding[shown], start)
-        return in_world(algorithm, seeds, schedule, bank)
+        return in_world(algorithm, schedule)
 
     return make
 
@@ -47,6 +47,6 @@ def make_task_algorithm(bank, encoders, make_config, in_world):
         config = replace(config, **{"task_batch_size": 4, **changes})
         of_tasks = bank.for_tasks(bank.tasks[: schedule.n_tasks])
         algorithm = entry(name).make(config, seeds=seeds, bank=of_tasks.seen(), encoders=encoders)
-        return in_world(algorithm, seeds, schedule, of_tasks)
+        return in_world(algorithm, schedule)
 
     return make

@@ -145,7 +145,7 @@ def test_targets_are_clipped_to_the_attainable_returns(make_bgpo, variant, chang
 def test_what_an_algorithm_lacks_is_refused(make_config, bank, in_world):
     config = make_config(name="without-gwr").algorithm
     with pytest.raises(ValueError, match="needs trained encoders"):
-        in_world(BGPO(config, seeds=(0,), bank=bank.seen()), (0,), SCHEDULE)
+        in_world(BGPO(config, seeds=(0,), bank=bank.seen()), SCHEDULE)
     config = replace(make_config("state", "oracle").algorithm, demonstration_share=0.25)
     with pytest.raises(ValueError, match="demonstrations are latents"):
         BGPO(config, seeds=(0,), bank=bank.seen())

@@ -22,7 +22,7 @@ def make(bank, encoders, make_config, in_world):
     def make(name, seeds=SEEDS, **changes):
         config = replace(make_config(name=name).algorithm, **changes)
         algorithm = entry(name).make(config, seeds=seeds, bank=bank.seen(), encoders=encoders)
-        return in_world(algorithm, seeds, TaskSchedule((0, 0, 0)))
+        return in_world(algorithm, TaskSchedule((0, 0, 0)))
 
     return make
 

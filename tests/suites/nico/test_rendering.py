@@ -143,11 +143,6 @@ def test_a_renderer_of_another_thread_changes_no_frames(physics, renderer, ended
     np.testing.assert_array_equal(renderer.render(physics.data.ptr), before)
 
 
-def test_the_driver_has_the_same_name_in_any_thread(renderer):
-    with ThreadPoolExecutor(1) as pool:
-        assert pool.submit(renderer.driver).result() == renderer.driver() != "unknown"
-
-
 def test_a_process_with_renderers_of_threads_ends_silently():
     code = """
 import threading, time
