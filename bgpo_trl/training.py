@@ -20,14 +20,13 @@ from bgpo_trl.algorithms import Algorithm, entry
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.logged_episodes import LoggedEpisodes
 from bgpo_trl.encoders.mismatch import doubt_frames
 from bgpo_trl.encoders.representation import Representation, check_savable
 from bgpo_trl.evaluation import Evaluator
 from bgpo_trl.files.checkpoint import save_checkpoint
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.writing import lock_directory
-from bgpo_trl.logged import replay_logged
+from bgpo_trl.logged import LoggedEpisodes, replay_logged
 from bgpo_trl.machine import interrupts_wait
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.cost import CostLog

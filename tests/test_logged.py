@@ -11,9 +11,8 @@ import torch
 
 from bgpo_trl.algorithms.proposal_trials import ProposalTrials
 from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations, write_logged_episodes
-from bgpo_trl.data.logged_episodes import LoggedEpisodes
 from bgpo_trl.encoders.representation import Representation
-from bgpo_trl.logged import replay_logged
+from bgpo_trl.logged import LoggedEpisodes, replay_logged
 from bgpo_trl.modules.group_trials import GroupTrials
 from bgpo_trl.scenes.nico import NICO
 from tests.helpers import finish, interrupt, interrupt_call, rows, spied

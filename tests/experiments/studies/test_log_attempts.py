@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from log_attempts import LogArguments, attempt, log_attempts
 
-from bgpo_trl.data.logged_episodes import LoggedEpisodes
+from bgpo_trl.logged import LoggedEpisodes
 from bgpo_trl.scenes.nico import NICO, NicoEnv
 
 TASK = "push_green_to_white"
