@@ -97,7 +97,7 @@ class LoadedRun:
             encoders=encoders,
             scene=find_scene(config.scene),
         )
-        if not algorithm.needs_replay:
+        if not algorithm.needs_replay and "replay" in state:
             state = {**state, "replay": algorithm.replay.state_dict()}  # avoids reading it
         algorithm.load_state_dict(state)
         return cls(config, algorithm, encoders, bank, episodes)
@@ -105,7 +105,7 @@ class LoadedRun:
     def __reduce__(self) -> tuple[Any, ...]:
         state = self.algorithm.state_dict()
         if not self.algorithm.needs_replay:
-            del state["replay"]
+            state.pop("replay", None)
         parts = (type(self.algorithm), self.config, state, self.encoders, self.bank, self.episodes)
         return LoadedRun.restore, parts
 

@@ -202,8 +202,9 @@ class BGPO(Algorithm):
         """Learn from demonstrations, and logged episodes if any, before the first episode.
 
         GWR-B and groups first learn all demonstrations, so that these are stored with the behaviors
-        and groups at the end. Then each seed makes its updates, as many for each of its groups, in
-        the order of their numbers.
+        and groups at the end. Then each seed makes its updates: its groups come to play one after
+        the other, in the order of their numbers, each for as many. Groups before them learn on
+        while they are active (``active_groups``).
 
         Args:
             rows: Positions in the bank, in the order of each seed, int64 ``[N, S]``.

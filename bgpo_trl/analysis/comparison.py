@@ -155,15 +155,17 @@ def _setting(runs: list[Run]) -> Setting:
     )
     for run in runs[1:]:
         check_conditions(runs[0], run)
-    places: dict[str, list[Path]] = {}
+    alike: dict[str, list[Run]] = {}
     for run in runs:
-        places.setdefault(title_of(run), []).append(run.place.resolve())
+        alike.setdefault(title_of(run), []).append(run)
     named: dict[str, Run] = {}
     for run in runs:
         title = title_of(run)
-        if len(alike := places[title]) > 1:
-            within = run.place.resolve().relative_to(os.path.commonpath(alike))
-            title += f" ({run.place.name if within == Path() else within})"
+        if len(others := alike[title]) > 1:
+            places = [other.place.resolve() for other in others]
+            own = run.place if places.count(run.place.resolve()) == 1 else run.directory
+            within = own.resolve().relative_to(os.path.commonpath(places))
+            title += f" ({own.name if within == Path() else within})"
         if title in named:
             raise ValueError(f"{run.directory} is given twice: name each run once")
         named[title] = run

@@ -87,11 +87,22 @@ def area_under_curve(success: ArrayLike, episodes: ArrayLike) -> Values:
 
 
 def area_scores(run: Run) -> Values:
-    """Return the area under each task's curve since its presentation, ``[S, T]``."""
+    """Return the area under each task's curve since its presentation, ``[S, T]``.
+
+    Raises:
+        ValueError: If a seed has no test of a task in an evaluation since then.
+    """
     areas = []
     for task, start in enumerate(run.starts):
         since = run.episodes > start
         curve = run.success[:, since, task]
+        lacking = np.argwhere(np.isnan(curve))
+        if len(lacking):
+            seed, test = lacking[0]
+            raise ValueError(
+                f"{run.directory} has no test of seed {run.seeds[seed]} in {run.tasks[task]} after "
+                f"{run.episodes[since][test]} episodes: test each presented task at every test"
+            )
         areas.append(area_under_curve(curve, run.episodes[since] - start))
     return np.stack(areas, axis=-1)
 

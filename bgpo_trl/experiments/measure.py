@@ -59,6 +59,7 @@ def measure(
     summary = {
         "command": command(),
         "episodes": config.episodes,
+        "learned_episodes": trainer.world.source.episode.tolist(),
         "random_success": dict(zip(config.tasks, random_success.tolist(), strict=True)),
         "demonstrated_steps": demonstrated_steps(bank.seen(config.demonstrations)),
         "needs_label": algorithm.needs_label,

@@ -288,6 +288,7 @@ class BehaviorGroups:
         return {
             **{name: torch.from_numpy(getattr(self, name).copy()) for name in _ARRAYS},
             **{name: [*getattr(self, name)] for name in _LISTS},
+            "latest": self._latest,
             "revision": self.revision,
             "trials": self.trials.state_dict(),
         }
@@ -299,6 +300,9 @@ class BehaviorGroups:
             ValueError: If it is damaged, or of another number of features; nothing has changed
                 then.
         """
+        lacking = {*_ARRAYS, *_LISTS, "latest", "revision", "trials"} - state.keys()
+        if lacking:
+            raise ValueError(f"the state lacks {min(lacking)}: load one that state_dict returned")
         arrays: dict[str, Any] = {name: state[name].numpy().copy() for name in _ARRAYS}
         if arrays["points"].shape[-1] != self.n_features:
             raise ValueError(
@@ -311,7 +315,7 @@ class BehaviorGroups:
         vars(self).update(arrays)
         for name in _LISTS:
             setattr(self, name, [*state[name]])
-        self.revision = state["revision"]
+        self._latest, self.revision = state["latest"], state["revision"]
         self.trials.load_state_dict(state["trials"])
         self._fit_metric(len(self.cluster))
         self._measure()

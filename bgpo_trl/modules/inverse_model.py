@@ -45,8 +45,8 @@ class InverseModel(nn.Module):
             z: Latents ``[N, T, latent_size]``; values at or beyond ``length`` are ignored.
             length: Latents of each episode, int64 ``[N]`` in 1..T; later actions are undefined.
         """
-        episode = torch.arange(len(z)).unsqueeze(-1).expand(-1, z.shape[1] - 1)
-        step = torch.arange(z.shape[1] - 1).expand_as(episode)
+        episode = torch.arange(len(z), device=z.device).unsqueeze(-1).expand(-1, z.shape[1] - 1)
+        step = torch.arange(z.shape[1] - 1, device=z.device).expand_as(episode)
         return self.network(window(z, length, episode, step)).clamp(-1.0, 1.0)
 
 
@@ -59,7 +59,7 @@ def window(z: Tensor, length: Tensor, episode: Tensor, step: Tensor) -> Tensor:
         episode: Episodes, int64 ``[...]``.
         step: Step of each, int64 ``[...]``.
     """
-    around = step.unsqueeze(-1) + torch.arange(-_BEFORE, _AFTER + 1)
+    around = step.unsqueeze(-1) + torch.arange(-_BEFORE, _AFTER + 1, device=z.device)
     last = (length[episode] - 1).unsqueeze(-1)
     around = torch.minimum(around.clamp_min(0), last)
     return z[episode.unsqueeze(-1), around].flatten(-2)

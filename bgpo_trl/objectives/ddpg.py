@@ -58,7 +58,8 @@ class DDPGLoss(LossModule):
        of steps of the transition. ``V`` is the lower value of two target critics. All pairs
        take turns, one in each call of `loss_value` (Chen et al., 2021, "Randomized Ensembled Double
        Q-Learning", draw pairs at random). If the actor learns in every second call, it sees every
-       second pair.
+       second pair: of five critics each, but the second most and the fourth least often; of four
+       critics never the third.
     2. *Actor.* The actor ascends the mean of the same two critics. With a weight of ``imitation``,
        it descends the squared distance to demonstrated actions too (Nair et al., 2018, "Overcoming
        Exploration in Reinforcement Learning with Demonstrations"). The weight fades (Rajeswaran et
@@ -538,11 +539,12 @@ class ForeachSoftUpdate(SoftUpdate):
             for pair in _float_pairs(target, getattr(loss_module, name.removeprefix("target_")))
         ]
         self._target_tensors, self._source_tensors = map(list, zip(*pairs, strict=True))
-        self._move = get_ema_multi_avg_fn(1 - tau)
+        self._decay = 1 - tau
 
     def step(self) -> None:
         """Update all targets: ``target <- (1 - tau) * target + tau * source``."""
-        self._move(self._target_tensors, self._source_tensors, None)
+        move = get_ema_multi_avg_fn(self._decay)  # a closure, which could not be pickled
+        move(self._target_tensors, self._source_tensors, None)
 
 
 def _float_pairs(

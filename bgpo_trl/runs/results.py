@@ -142,7 +142,8 @@ def read_json(
 
 # Entries of config.json that belong to keeping a run, not to what it is.
 OF_KEEPING = ("seeds", "checkpoint_minutes", "task_modules")
-_OF_SEEDS = ("nodes", "groups", "group_purity")  # entries of summary.json, a value per seed
+# Entries of summary.json, a value per seed.
+_OF_SEEDS = ("learned_episodes", "nodes", "groups", "group_purity")
 
 
 @dataclass(frozen=True, eq=False)  # Tables have no truth value.
@@ -283,7 +284,11 @@ def read_run(directory: str | os.PathLike[str]) -> Run:
         name: read_table(directory / name) for name in COLUMNS if find_table(directory / name)
     }
     for name, table in tables.items():
-        for column, known in (("seed", config["seeds"]), ("task", tasks)):
+        for column, known in (
+            ("algorithm", [config["name"]]),
+            ("seed", config["seeds"]),
+            ("task", tasks),
+        ):
             others = set(table.get(column, ())) - set(known)
             if others:
                 raise ValueError(
@@ -291,6 +296,11 @@ def read_run(directory: str | os.PathLike[str]) -> Run:
                     f"{', '.join(map(str, known))}: put it back as the run left it"
                 )
     tests = tables.get("eval.csv", pd.DataFrame(columns=pd.Index(_READ["eval.csv"])))
+    if len(tests) and tests["episode"].max() > config["episodes"]:
+        raise ValueError(
+            f"{directory / 'eval.csv'} has tests after {tests['episode'].max()} episodes, the run "
+            f"{config['episodes']}: leave later tests out, or correct episodes in config.json"
+        )
     others = (tables.get(name) for name in ("train.csv", "final.csv", "cost.csv"))
     return Run((directory,), config, summary, tests, *others)
 

@@ -9,9 +9,20 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec, Unbounded
-from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, Transform, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    RandomTruncationTransform,
+    RewardSum,
+    StepCounter,
+    TerminateTransform,
+    Transform,
+    TransformedEnv,
+)
 
 from bgpo_trl.seeding import Seeding
+
+_ENDING = (StepCounter, TerminateTransform, RandomTruncationTransform)  # which end episodes
 
 
 def starting(tensordict: TensorDictBase) -> Tensor:
@@ -38,9 +49,10 @@ class EpisodeTransform(Transform):
 
     An episode is that of a row: it ends with ``done`` ``[*B, 1]``, the environment's own, not one
     of several agents. The entries must stay in the observation, since the next step reads them.
-    ``StepCounter`` must come before the transform, so that ``done`` includes time-outs; it is
-    required if the transform learns at the end of episodes. ``RewardSum`` must come after a
-    transform that changes the reward.
+    ``StepCounter`` must come before the transform, so that ``done`` includes time-outs, and within
+    the same process: an end that workers or a collector's ``max_frames_per_traj`` add outside is
+    not seen. A transform that acts at the end of episodes requires a ``StepCounter``. ``RewardSum``
+    must come after a transform that changes the reward.
 
     One seed for all: TorchRL's ``TransformedEnv.set_seed`` reaches only the base environment.
     `NicoEnv` therefore records its last ``set_seed``, and a transform that draws at random looks
@@ -52,12 +64,14 @@ class EpisodeTransform(Transform):
         reads: Entries read; TorchRL's ``RenameTransform`` serves environments with other names.
         writes: Entries written.
         learn: Whether it learns at the end of an episode.
+        acts_at_end: Whether it acts at the end of an episode even if it does not learn.
         changes_reward: Whether it changes the reward.
     """
 
     reads: ClassVar[Sequence[str]] = ()
     writes: ClassVar[Sequence[str]] = ()
     learn: bool = False
+    acts_at_end: bool = False
     changes_reward: bool = False
     _seeding: Seeding | None = None
 
@@ -109,33 +123,35 @@ class EpisodeTransform(Transform):
         """Add the entries of this transform.
 
         Raises:
-            ValueError: If transforms are in the wrong order, or it learns without a
-                ``StepCounter``.
+            ValueError: If transforms are in the wrong order, or it acts at the end of episodes
+                without a ``StepCounter``.
         """
-        self._check_order()
+        self._check_order(observation_spec)
         for key, spec in self._entries(observation_spec).items():
             observation_spec[key] = spec
         self._check_limit(observation_spec)
         return observation_spec
 
-    def _check_order(self) -> None:
+    def _check_order(self, observation_spec: Composite) -> None:
         before, after = self._others()
-        if any(isinstance(t, StepCounter) for t in after):
+        late = next((t for t in after if isinstance(t, _ENDING)), None)
+        if late is not None:
             raise ValueError(
-                f"put StepCounter before {type(self).__name__}, which has to see where episodes end"
+                f"put {type(late).__name__} before {type(self).__name__}, which has to see where "
+                "episodes end"
             )
-        if self.changes_reward and any(isinstance(t, RewardSum) for t in before):
+        sums = any(isinstance(t, RewardSum) for t in before)
+        if self.changes_reward and (sums or "episode_reward" in _names(observation_spec)):
             raise ValueError(f"put RewardSum after {type(self).__name__}, which changes the reward")
 
     def _check_limit(self, observation_spec: Composite) -> None:
-        if not self.learn or not isinstance(self.container, TransformedEnv):
+        if not (self.learn or self.acts_at_end) or not isinstance(self.container, TransformedEnv):
             return
-        # A StepCounter within the workers of a ParallelEnv is visible only by the entry it writes.
-        entries = [key if isinstance(key, str) else key[-1] for key in observation_spec.keys(True)]
-        if "step_count" in entries or any(isinstance(t, StepCounter) for t in self._others()[0]):
+        counted = any(isinstance(t, StepCounter) for t in self._others()[0])
+        if counted or "step_count" in _names(observation_spec):
             return
         raise ValueError(
-            f"{type(self).__name__} learns when episodes end: put StepCounter(50) before it, or "
+            f"{type(self).__name__} acts when episodes end: put StepCounter(50) before it, or "
             "StepCounter() if the environment has its own time limit"
         )
 
@@ -147,6 +163,11 @@ class EpisodeTransform(Transform):
             env = env.base_env
         at = transforms.index(self) if transforms else 0
         return transforms[:at], transforms[at + 1 :]
+
+
+def _names(spec: Composite) -> set[str]:
+    """Return the names of entries, by which transforms within the workers of an env show."""
+    return {key if isinstance(key, str) else key[-1] for key in spec.keys(True)}
 
 
 def _flat(transform: nn.Module) -> Iterator[nn.Module]:

@@ -67,6 +67,7 @@ class BehaviorMatchingReward(EpisodeTransform):
     reads = ("latent", "behavior", "reward")
     writes = ("lae_h", "lae_c", "extrinsic_reward", "intrinsic_reward")
     changes_reward = True
+    acts_at_end = True
 
     def __init__(self, lae: SequenceAutoencoder, beta: float = 0.1) -> None:
         if not 0 <= beta < math.inf:

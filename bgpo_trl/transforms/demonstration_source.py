@@ -140,6 +140,7 @@ class DemonstrationSource(EpisodeTransform):
     """
 
     writes = ("task", "demo_embedding", "demo_index")
+    acts_at_end = True
     episode: Tensor
     _stream: Tensor
     _embedding: Tensor

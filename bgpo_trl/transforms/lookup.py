@@ -196,6 +196,19 @@ class GroupLookup(DemonstrationLookup):
         super().__init__(network, learn=learn)
         self.starts = starts
 
+    def get_extra_state(self) -> list[dict[str, Any]]:
+        """Return the states of the groups, for ``state_dict``."""
+        return [groups.state_dict() for groups in self.network]
+
+    def set_extra_state(self, state: list[dict[str, Any]]) -> None:
+        """Restore the states of the groups.
+
+        Raises:
+            ValueError: If they are of another number of rows, or as from `BehaviorGroups`.
+        """
+        for groups, saved in zip(self.network, state, strict=True):
+            groups.load_state_dict(saved)
+
     def look_up(self, embedding: Tensor) -> tuple[Tensor, ...]:
         """Return the entries for embeddings ``[*B, 32]``; the expert is that of the group."""
         pairs = zip(self.network, self._of_rows(embedding), strict=True)
@@ -226,6 +239,11 @@ class GroupLookup(DemonstrationLookup):
                 groups.adapt(phi[row])
                 continue
             index = int(tensordict.get("demo_index").flatten()[row])
+            if index >= len(self.starts):
+                raise ValueError(
+                    f"starts has {len(self.starts)} rows, demonstration {index} was shown: give "
+                    "the first latent of each demonstration of the bank"
+                )
             groups.adapt(phi[row], self.starts[index])
             if self.tries:
                 success = bool(next_tensordict.get("success").flatten()[row])
@@ -237,6 +255,13 @@ class GroupLookup(DemonstrationLookup):
 
     def _entries(self, observation_spec: Composite) -> dict[str, TensorSpec]:
         demonstration = self._demonstration_spec(observation_spec)
+        if self.learn and self.starts is not None:
+            for key, source in (
+                ("latent", "FrameEncoder"),
+                ("demo_index", "DemonstrationSource"),
+                ("success", "an environment with successes"),
+            ):
+                self._read_spec(observation_spec, key, source)
         dtypes = (torch.int64, demonstration.dtype, torch.bool, torch.int64)
         return {
             key: unbounded(observation_spec, dtype=dtype)

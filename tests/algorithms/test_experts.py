@@ -121,6 +121,22 @@ def assert_policy(experts, seed, group, tensors):
 
 
 @every_kind
+def test_before_an_ancestor_has_played_an_expert_is_the_initial_one(name):
+    experts = make(name)
+    initial = tensors_of(experts, 0, 0)
+    experts.play([2, 0])
+    learn(experts, 1)
+    assert differing(tensors_of(experts, 0, 0), initial)
+    for group in (0, 1):
+        assert_policy(experts, 0, group, initial)
+    saved = make(name)
+    saved.load_state_dict(experts.state_dict())
+    assert_policy(saved, 0, 1, initial)
+    slots = experts.play([1, 0])
+    assert not differing(tensors_of(experts, 0, int(slots[0])), initial)
+
+
+@every_kind
 def test_what_is_put_aside_comes_back_as_it_was(name):
     """Six groups in two slots, of which some end: whatever else was learned, bit for bit."""
     experts, left = make(name), [{}, {}]

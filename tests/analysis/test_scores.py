@@ -21,6 +21,10 @@ def test_area_under_curve_by_hand():
     b = (5 * 0.2 + 5 * 0.5 + 5 * 0.65 + 5 * 0.8) / 20
     c = (5 * 0.0 + 5 * 0.2) / 10
     np.testing.assert_allclose(scores.area_scores(make_run())[0, 1:], [b, c])
+    success = np.stack([SUCCESS] * 2)
+    success[1, -2, 2] = NAN
+    with pytest.raises(ValueError, match="has no test of seed 1 in c after 25 episodes"):
+        scores.area_scores(make_run(success))
 
 
 def test_late_scores_average_the_last_tenth_of_training():

@@ -5,6 +5,7 @@ import shutil
 from collections import Counter
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -227,6 +228,17 @@ def test_runs_whose_folders_have_one_name_are_reported_apart(tmp_path, refused):
     assert {name: row[2] for name, row in rows.items() if "BGPO" in name} == {
         "BGPO (old/concurrent-bgpo)": "90.0 [90, 90]",
         "BGPO (new/concurrent-bgpo)": "50.0 [50, 50]",
+    }
+    for number, (name, beta) in enumerate(product("mn", (0.1, 0.1))):
+        settings = {"max_steps": 50, "beta": 0.5 if name == "n" else beta}
+        one = write_run(tmp_path / "seeds", "bgpo", [9], directory=f"{name}{number % 2}")
+        edit(one / "config.json", seeds=[number % 2], algorithm=settings)
+        rows = (one / "eval.csv").read_text().replace("bgpo,0,", f"bgpo,{number % 2},")
+        (one / "eval.csv").write_text(rows)
+    report(ReportArguments((tmp_path / "seeds",)))
+    assert {*table_of(tmp_path / "seeds", "3 tasks, all from the start")} >= {
+        "BGPO (m0)",
+        "BGPO (n0)",
     }
     twice = ReportArguments((tmp_path / "old", tmp_path / "old"), out=tmp_path)
     refused(partial(report, twice), "concurrent-bgpo is given twice", "name each run once")

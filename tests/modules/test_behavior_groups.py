@@ -156,10 +156,20 @@ def test_damaged_states_and_those_of_other_sizes_are_rejected_and_change_nothing
         BehaviorGroups(3).state_dict(),
         {**before, "group": before["group"] + 1},
         {**before, "member": before["member"][1:]},
+        {},
     ):
         with pytest.raises(ValueError, match="state"):
             groups.load_state_dict(bad)
     torch.testing.assert_close(groups.state_dict(), before, rtol=0, atol=0)
+
+
+def test_a_success_after_a_load_is_that_of_the_demonstration_shown_last():
+    groups = BehaviorGroups(4)
+    show(groups, around(0, 5))
+    loaded = BehaviorGroups(4)
+    loaded.load_state_dict(groups.state_dict())
+    loaded.end(0, 0, fits=True, success=True)
+    assert loaded.tried.tolist() == loaded.won.tolist() == [0, 0, 0, 0, 1]
 
 
 def test_joined_groups_stay_joined_when_clustered_anew():

@@ -31,15 +31,20 @@ def test_success_is_read_by_seed_evaluation_and_task(tmp_path):
     np.testing.assert_array_equal(run.success, expected)
 
 
-def test_tables_of_other_seeds_or_tasks_are_refused(tmp_path):
+@pytest.mark.parametrize(
+    ("entry", "other", "cause"),
+    [
+        ("seeds", [0, 1], r"the seed 2, which is none of 0, 1: put"),
+        ("tasks", ["a", "b", "c"], r"the task .* none of a, "),
+        ("name", "mine", r"the algorithm 'bgpo', which is none of mine"),
+        ("episodes", 39, r"tests after 40 episodes, the run 39: leave"),
+    ],
+)
+def test_tables_that_do_not_fit_the_settings_are_refused(tmp_path, entry, other, cause):
     run = write_run(tmp_path, "bgpo", 9)
-    for column, entry, other in (("seed", "seeds", [0, 1]), ("task", "tasks", ["a", "b", "c"])):
-        edit(run / "config.json", **{entry: other})
-        with pytest.raises(
-            ValueError, match=rf"eval\.csv has the {column} .* none of {other[0]}, "
-        ):
-            read_run(run)
-        edit(run / "config.json", seeds=[0, 1, 2])
+    edit(run / "config.json", **{entry: other})
+    with pytest.raises(ValueError, match=r"eval\.csv has " + cause):
+        read_run(run)
 
 
 def test_a_compressed_table_that_is_damaged_is_refused(tmp_path):

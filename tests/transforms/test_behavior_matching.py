@@ -7,6 +7,7 @@ from torchrl.envs import (
     RenameTransform,
     RewardSum,
     SerialEnv,
+    StepCounter,
     TransformedEnv,
     check_env_specs,
 )
@@ -60,7 +61,7 @@ def test_wrong_orders_are_refused():
     vae = make_modules()[0]
 
     def reset(*transforms):
-        env = TransformedEnv(MockEnv(), FrameEncoder(vae))
+        env = TransformedEnv(MockEnv(), Compose(FrameEncoder(vae), StepCounter(50)))
         for transform in transforms:  # each around the one before
             env = TransformedEnv(env, transform, auto_unwrap=False)
         env.reset()
@@ -78,6 +79,11 @@ def test_wrong_orders_are_refused():
         reset(behavior(), Compose(RewardSum(), bonus()))
     with pytest.raises(ValueError, match=refusal):
         reset(Compose(behavior(), RewardSum()), bonus())
+    within = TransformedEnv(
+        MockEnv(), Compose(FrameEncoder(vae), behavior(), StepCounter(50), RewardSum())
+    )
+    with pytest.raises(ValueError, match=refusal):
+        TransformedEnv(SerialEnv(1, lambda: within), bonus()).reset()
     reset(behavior(), Compose(bonus(), RewardSum()))
 
 

@@ -59,7 +59,8 @@ def test_draws_tasks_uniformly_then_their_demonstrations():
     bank, n = SimpleNamespace(embedding=torch.zeros(12, 32), task=task), 1000
     options = {"batch_size": [n], "generator": torch.Generator().manual_seed(0)}
     source = DemonstrationSource(bank, TaskSchedule((0, 0, 1)), **options)
-    drawn = TransformedEnv(MockEnv([0] * n), source).reset()["demo_index"]
+    parts = Compose(StepCounter(50), source)
+    drawn = TransformedEnv(MockEnv([0] * n), parts).reset()["demo_index"]
     counts = torch.bincount(drawn, minlength=12)
     expected = torch.tensor([n / 16] * 8 + [n / 4] * 2)
     assert counts[10:].sum() == 0

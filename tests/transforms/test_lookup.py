@@ -6,10 +6,20 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, SerialEnv, StepCounter, TransformedEnv, check_env_specs
+from torchrl.envs import (
+    Compose,
+    RandomTruncationTransform,
+    RenameTransform,
+    SerialEnv,
+    StepCounter,
+    TerminateTransform,
+    TransformedEnv,
+    UnaryTransform,
+    check_env_specs,
+)
 
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
-from bgpo_trl.transforms import BehaviorLookup, GroupLookup
+from bgpo_trl.transforms import BehaviorLookup, BehaviorMatchingReward, GroupLookup
 from tests.transforms.environment import MockEnv, make_modules, make_source, play
 
 
@@ -66,29 +76,48 @@ def test_learns_only_from_whole_episodes_and_while_learn_is_set():
         assert not now["weights"].equal(then["weights"])
 
 
-def test_learning_needs_a_step_counter_before_it():
+def test_what_acts_when_episodes_end_has_to_see_where_they_end():
     def make(*transforms, learn=True, base=None, seeds=None):
         lookup = BehaviorLookup(make_modules(seeds)[2], learn=learn)
-        parts = Compose(*transforms, make_source(seeds), lookup)
-        return TransformedEnv(base or MockEnv(), parts, auto_unwrap=False), lookup
+        parts = Compose(*transforms, lookup)
+        return TransformedEnv(base or MockEnv(seeds), parts, auto_unwrap=False), lookup
 
-    with pytest.raises(ValueError, match=r"put StepCounter\(50\) before"):
-        make()[0].reset()
-    env, lookup = make(learn=False)
+    def shown():  # a demonstration without a source
+        return UnaryTransform(["task"], ["demo_embedding"], fn=lambda task: torch.zeros(32))
+
+    without = r"put StepCounter\(50\) before"
+    with pytest.raises(ValueError, match=without):
+        make(shown())[0].reset()
+    env, lookup = make(shown(), learn=False)
     env.reset()
     lookup.learn = True
-    with pytest.raises(ValueError, match="StepCounter"):
+    with pytest.raises(ValueError, match=without):
         env.reset()
-    env, _ = make()
-    env.append_transform(StepCounter(5))
-    with pytest.raises(ValueError, match="put StepCounter before"):
-        env.reset()
+    counted = lambda: TransformedEnv(MockEnv(), make_source())  # noqa: E731
+    rewarded = lambda: with_bonus(make_source())  # noqa: E731
+    for within in (counted, rewarded):
+        with pytest.raises(ValueError, match=without):
+            TransformedEnv(SerialEnv(2, within), StepCounter(50)).reset()
+    for late in (StepCounter(5), RandomTruncationTransform(2, 3), TerminateTransform(torch.any)):
+        env, _ = make(StepCounter(), make_source())
+        env.append_transform(late)
+        with pytest.raises(ValueError, match=f"put {type(late).__name__} before"):
+            env.reset()
 
-    make(StepCounter())[0].reset()  # the environment has a limit of its own
-    make(StepCounter(50, step_count_key="time"))[0].reset()
+    make(StepCounter(), make_source())[0].reset()  # the environment has a limit of its own
+    make(StepCounter(50, step_count_key="time"), make_source())[0].reset()
     limited = TransformedEnv(MockEnv(), StepCounter(50))
-    make(base=limited)[0].reset()
-    make(base=SerialEnv(2, lambda: limited), seeds=[0, 1])[0].reset()
+    make(make_source(), base=limited)[0].reset()
+    make(make_source([0, 1]), base=SerialEnv(2, lambda: limited), seeds=[0, 1])[0].reset()
+
+
+def with_bonus(source):
+    """An environment with an intrinsic reward, which does not see where its episodes end."""
+    latent = UnaryTransform(["task"], ["latent"], fn=lambda task: torch.zeros(64))
+    same = RenameTransform(["demo_embedding"], ["behavior"], create_copy=True)
+    return TransformedEnv(
+        MockEnv(), Compose(latent, source, same, BehaviorMatchingReward(make_modules()[1]))
+    )
 
 
 # ---- groups
@@ -157,3 +186,25 @@ def test_bad_batch_sizes_are_refused():
     env.append_transform(GroupLookup(other, learn=True))
     with pytest.raises(ValueError, match="batch_size"):
         env.reset()
+
+
+def test_groups_are_part_of_the_state_of_an_environment():
+    env, groups = make_groups([4, 2])
+    adapt(groups, 25)
+    new, found = make_groups([4, 2])
+    new.load_state_dict(env.state_dict())
+    for ours, theirs in zip(found, groups, strict=True):
+        assert str(ours.state_dict()) == str(theirs.state_dict()) and len(ours.numbers) > 1
+
+
+def test_what_trials_read_has_to_be_there():
+    lookup = GroupLookup([BehaviorGroups(32)], learn=True, starts=torch.zeros(3, 64))
+    with pytest.raises(ValueError, match="found no 'latent': put FrameEncoder before it"):
+        compose(lookup, None, 3).reset()
+    shown = {"demo_embedding": torch.rand(1, 32), "demo_index": torch.tensor([3])}
+    group = torch.zeros(1, dtype=torch.int64)
+    step = {"group": group, "group_novelty": torch.zeros(1), "expert": group.clone()}
+    step = TensorDict({**shown, **step, "group_fits": torch.ones(1, dtype=torch.bool)}, [1])
+    ended = TensorDict({"done": torch.ones(1, 1, dtype=torch.bool)}, [1])
+    with pytest.raises(ValueError, match="starts has 3 rows, demonstration 3 was shown"):
+        lookup._step(step, ended)
