@@ -252,6 +252,12 @@ class Trainer:
             if self.config.offline_updates:
                 self._learn_offline()
             self._state = env.reset()
+            if self.world.state_dict()["simulation"] is None:
+                warnings.warn(
+                    f"simulations of the scene {self._scene.name!r} cannot be saved: if it is "
+                    "interrupted, this run cannot be resumed (define save and load)",
+                    stacklevel=2,
+                )
             self._compare_frames()
             self.save()  # Rows without a checkpoint could not be resumed.
         state, saved = self._state, time.monotonic()

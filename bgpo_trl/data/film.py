@@ -7,6 +7,7 @@ import importlib
 import io
 import re
 from collections.abc import Iterable, Iterator
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -114,8 +115,16 @@ def alike(frames: Iterable[NDArray[np.uint8]], what: str) -> Iterator[NDArray[np
 
 
 def _images_in(folder: Path) -> Iterator[NDArray[np.uint8]]:
-    images = (file for file in folder.iterdir() if file.suffix.lower() in _IMAGES)
-    for file in sorted(images, key=_with_numbers):
+    images = [file for file in folder.iterdir() if file.suffix.lower() in _IMAGES]
+    order = sorted(images, key=lambda file: _with_numbers(file, r"(\d+)"))
+    by_time = sorted(images, key=lambda file: _with_numbers(file, r"(\d+\.\d+|\d+)"))
+    if order != by_time:
+        other = next(a for a, b in zip(order, by_time, strict=True) if a != b)
+        raise UnreadableError(
+            f"{other} has a point in its name, by which the order of frames is not clear: number "
+            "them, as in 0001.png"
+        )
+    for file in order:
         with _decoding(file):
             yield decode_image(file.read_bytes())
 
@@ -145,7 +154,7 @@ def _decoding(file: Path) -> Iterator[None]:
         ) from error
 
 
-def _with_numbers(file: Path) -> list[tuple[int, str]]:
+def _with_numbers(file: Path, number: str) -> list[tuple[Decimal, str]]:
     """Return a key that sorts names with their numbers as numbers: 2.png before 10.png."""
-    parts = re.split(r"(\d+)", file.name)
-    return [(int(part), part) if part.isdecimal() else (-1, part) for part in parts]
+    parts = re.split(number, file.stem)
+    return [(Decimal(part if at % 2 else -1), part) for at, part in enumerate(parts)]

@@ -29,7 +29,7 @@ from bgpo_trl.encoders.representation import (
     split,
 )
 from bgpo_trl.files.csv_file import CsvFile
-from bgpo_trl.files.writing import check_folder, make_folder
+from bgpo_trl.files.writing import check_folder, lock_directory
 from bgpo_trl.scenes import Scene, find_scene
 
 _TERMS = ("reconstruction", "kl", "inverse")
@@ -90,9 +90,8 @@ def train_encoders(
     else:
         split(dataset)  # probed after the training
         fit = partial(retrain_inverse, keep, play, config, shown=dataset)
-    make_folder(folder)
     check_folder(weights.parent)  # before hours of training
-    with CsvFile(folder / "train.csv", _COLUMNS) as file:
+    with lock_directory(folder), CsvFile(folder / "train.csv", _COLUMNS) as file:
         representation = fit(
             command=command,
             checkpoint=folder / "checkpoint",
@@ -102,7 +101,8 @@ def train_encoders(
         )
     save_representation(representation, weights)
     made = {"tasks": tasks, "actions": scene.bank_actions, "spread": spread}
-    bank = make_bank(representation, dataset, **made, compare=False)
+    # Without play, the inverse model has learned from these very actions.
+    bank = make_bank(representation, dataset, **made, compare=play is not None)
     bank.save(bank_path(weights))
     play = None if keep else play
     found = probe(representation, dataset, folder, play=play, columns=scene.state)

@@ -69,10 +69,16 @@ def check_robot(arguments: DoctorArguments) -> str:
     import torch
     from PIL import Image
 
-    from bgpo_trl.scenes import find_scene
+    from bgpo_trl.scenes import RobotEnv, find_scene
     from bgpo_trl.scenes.check import check_scene
 
     scene = find_scene(arguments.scene)
+    if scene.make_env is None:
+        return "it has no simulation to try"
+    one = scene.simulate(scene.default_tasks, batch_size=[1])
+    one.close()
+    if isinstance(one, RobotEnv):
+        return "a physical robot, which is not moved to try it"
     env = scene.simulate(scene.default_tasks, batch_size=[10], seed=0)
     torch.manual_seed(0)
     start = time.perf_counter()

@@ -20,6 +20,7 @@ from bgpo_trl.experiments.arguments import (
     RecordArguments,
 )
 from bgpo_trl.experiments.settings import chosen_tasks
+from bgpo_trl.files.tensor_file import load_tensors
 from bgpo_trl.machine import choose_device
 from bgpo_trl.runs.provenance import command
 from bgpo_trl.scenes import find_scene
@@ -76,6 +77,8 @@ def bank(arguments: MakeBankArguments) -> str:
     dataset, meta = _demonstrations(arguments.dataset)
     scene = find_scene(meta["scene"])
     weights = arguments.encoders or default_weights(scene=scene)
+    if arguments.out.exists() and "embedding" not in load_tensors(arguments.out)[0]:
+        raise ValueError(f"{arguments.out} is no bank, and is kept: name another file to write")
     made = make_bank(
         load_representation(weights, scene=scene),
         dataset,

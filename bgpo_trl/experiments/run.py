@@ -21,6 +21,7 @@ from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.experiments.arguments import Arguments, BankArguments
 from bgpo_trl.experiments.measure import draw, measure
 from bgpo_trl.experiments.settings import (
+    begun_with,
     changed_hyperparameters,
     chosen_tasks,
     named_directory,
@@ -30,7 +31,7 @@ from bgpo_trl.files.writing import lock_directory, write_json
 from bgpo_trl.machine import choose_device, keep_freed_memory, set_threads
 from bgpo_trl.runs.config_file import Digests, read_config, read_encoder_settings
 from bgpo_trl.runs.dashboard import check_installed, tensorboard_logger, wandb_logger
-from bgpo_trl.runs.demonstrations import load_inputs, own_weights
+from bgpo_trl.runs.demonstrations import BANK, load_inputs, own_weights
 from bgpo_trl.runs.directory import holds_run
 from bgpo_trl.runs.growth import Grown, add_task, distinctness
 from bgpo_trl.runs.provenance import command, commit_of_code, versions
@@ -77,10 +78,11 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
     if arguments.resume and (out / "config.json").exists():
         saved, digests = read_config(out / "config.json")
         config = _continued(arguments, config, saved)
-        if added in saved.tasks[-1:]:  # the same command once more
-            added = None
+        if added in saved.tasks[-1:]:  # the same command once more; the run has the bank
+            added, arguments = None, replace(arguments, bank=None)
         if added is None and saved == config and is_finished(out, config.episodes):
             return f"{out} is finished, all {config.episodes} episodes: --episodes makes it longer"
+        _check_encoders(arguments, out, digests)
     loggers: list[Callable[[], Logger]] = []
     if arguments.wandb is not None:
         check_installed("wandb")
@@ -150,6 +152,47 @@ def _check(arguments: Arguments, config: RunConfig) -> None:
         )
 
 
+def _check_encoders(arguments: Arguments, out: Path, digests: Digests) -> None:
+    """Raise ``ValueError`` if a run that has begun is to get encoders that it does not have."""
+    if arguments.encoders is not None:
+        found = load_representation(arguments.encoders).identity
+        if found != digests.encoders:
+            raise ValueError(
+                f"--encoders: {out} was begun with the encoders {str(digests.encoders)[:12]}, not "
+                f"with {arguments.encoders} ({found[:12]}): leave the flag out, or name another "
+                "directory"
+            )
+    if arguments.train_encoders and not (own_weights(out).parent / "probes.json").exists():
+        raise ValueError(f"--train-encoders: {out} was begun with encoders: leave the flag out")
+
+
+def _repeated(
+    arguments: Arguments, config: RunConfig
+) -> tuple[Representation, DemonstrationBank] | None:
+    """Return the encoders and the bank of the run that ``--config`` names; None if it names none.
+
+    Raises:
+        ValueError: If the run has other tasks and files of its own, or began with logged episodes
+            and none are given.
+    """
+    if arguments.config is None:
+        return None
+    of_run, digests = begun_with(arguments)
+    if digests.encoders is None:
+        return None
+    path = arguments.config if arguments.config.is_dir() else arguments.config.parent
+    if digests.logged is not None and arguments.logged is None:
+        raise ValueError(f"{path} began with logged episodes: name them with --logged")
+    if (of_run.scene, of_run.tasks) != (config.scene, config.tasks):
+        if not (own_weights(path).exists() or (path / BANK).exists()):
+            return None  # those that come with the scene
+        raise ValueError(
+            f"{path} has the tasks {', '.join(of_run.tasks)}, not {', '.join(config.tasks)}: name "
+            "demonstrations of the others with --bank, or encoders with --encoders"
+        )
+    return load_inputs(path, config.tasks, digests, find_scene(config.scene))
+
+
 def _continued(arguments: Arguments, config: RunConfig, saved: RunConfig) -> RunConfig:
     """Return the settings with which a run continues: its task starts and evaluation interval.
 
@@ -176,6 +219,8 @@ def _inputs(
         return load_inputs(out, config.tasks, digests, scene)
     # A bank fits only the encoders that embedded it.
     given = arguments.encoders is not None or bank is not None
+    if not (given or arguments.train_encoders) and (found := _repeated(arguments, config)):
+        return found
     stage = STAGE_PRESETS.get(arguments.preset or "", {})
     if not arguments.train_encoders and (given or not stage):
         if arguments.resume and not holds_run(out) and (out / _DATASET).exists():

@@ -13,7 +13,7 @@ from bgpo_trl.algorithms import ALGORITHMS, entry
 from bgpo_trl.configs import PRESETS, RunConfig
 from bgpo_trl.configs.algorithms import AlgorithmConfig
 from bgpo_trl.experiments.arguments import SETTINGS, Arguments
-from bgpo_trl.runs.config_file import read_config
+from bgpo_trl.runs.config_file import Digests, read_config
 from bgpo_trl.runs.directory import differing_settings
 from bgpo_trl.scenes import SCENES, Scene, find_scene
 
@@ -26,7 +26,7 @@ def run_config(
     Raises:
         ValueError: If the settings are invalid, or a file, task or algorithm does not exist.
     """
-    config, name = _begin(arguments), arguments.algorithm
+    config, name = begun_with(arguments)[0], arguments.algorithm
     scene = find_scene(arguments.scene or config.scene)
     if name is not None and name != config.name:
         config = replace(config, name=name, algorithm=entry(name).config)
@@ -54,29 +54,54 @@ def run_config(
             f"eval_every must be at most the {config.episodes} episodes of the run, got "
             f"{config.eval_every}: its tests are its results"
         )
+    if max(config.task_starts) >= config.episodes:
+        raise ValueError(
+            f"task_starts must be below the {config.episodes} episodes of the run, got "
+            f"{max(config.task_starts)}: a task that starts later is never trained nor tested"
+        )
     return config
 
 
-def _begin(arguments: Arguments) -> RunConfig:
-    """Return the settings that flags change: of a run to be resumed, of a file, or a preset's."""
+def begun_with(arguments: Arguments) -> tuple[RunConfig, Digests]:
+    """Return the settings that flags change: of a run to be resumed, of a file, or a preset's.
+
+    Beside them are the digests of a run's files, if the settings are of one.
+
+    Raises:
+        ValueError: If the file is missing or invalid, or ``--algorithm`` would drop what it says.
+    """
     path, preset = arguments.config, PRESETS[arguments.preset or "quick"]
     if path is None:
         path = named_directory(arguments)
         stored = arguments.resume and arguments.preset is None
         if not stored or path is None or not (path / "config.json").exists():
-            return replace(preset, algorithm=ALGORITHMS[preset.name].config)
+            return replace(preset, algorithm=ALGORITHMS[preset.name].config), Digests(None, None)
     path = path / "config.json" if path.is_dir() else path
     if not path.exists():
         raise ValueError(f"--config: there is no file {path}: name one, or a run directory")
 
-    def usual(name: Any, scene: Any) -> RunConfig:
+    def usual(settings: dict[str, Any]) -> RunConfig:
+        own, asked = settings.get("name"), arguments.algorithm
+        of_file = "algorithm" in settings and "algorithm_class" not in settings  # not of a run
+        if of_file and None not in (own, asked) and own != asked:
+            raise ValueError(
+                f"--algorithm {asked}: {path} has hyperparameters of {own}: leave one out"
+            )
+        name = asked if own is None else own
         name = name if isinstance(name, str) and name in ALGORITHMS else preset.name
         config = replace(preset, name=name, algorithm=ALGORITHMS[name].config)
-        scene = arguments.scene if scene is None else scene
-        known = isinstance(scene, str) and scene in SCENES and scene != config.scene
-        return _in_scene(config, find_scene(scene)) if known else config
+        scene = settings.get("scene", arguments.scene)
+        if isinstance(scene, str) and scene in SCENES and scene != config.scene:
+            config = _in_scene(config, find_scene(scene))
+        # Task starts that the file lacks are those of its tasks and of its length.
+        episodes, tasks = settings.get("episodes"), settings.get("tasks")
+        if isinstance(episodes, int) and episodes >= 1:
+            config = _with_episodes(config, episodes)
+        if isinstance(tasks, list) and tasks and all(isinstance(task, str) for task in tasks):
+            config = _with_tasks(config, tuple(tasks))
+        return config
 
-    return read_config(path, usual)[0]
+    return read_config(path, usual)
 
 
 def named_directory(arguments: Arguments) -> Path | None:

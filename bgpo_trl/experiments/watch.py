@@ -18,7 +18,7 @@ from bgpo_trl.figures.frames import plot_frame_strips, save_gif
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.writing import check_folder
 from bgpo_trl.policy import Recognition, TrainedPolicy, load_run
-from bgpo_trl.scenes import Scene, Simulation, find_scene
+from bgpo_trl.scenes import RobotEnv, Scene, Simulation, find_scene
 
 _HEIGHT = 128  # (pixels) of each picture
 _BORDER, _CAPTION, _GAP = 4, 18, 8
@@ -63,11 +63,21 @@ def demonstrate(
 
 
 def play(policy: TrainedPolicy, task: str, demonstration: NDArray, seed: int) -> Episode:
-    """Show the policy a demonstration, and return its episode from the start with that seed."""
+    """Show the policy a demonstration, and return its episode from the start with that seed.
+
+    Raises:
+        ValueError: If the robot is no simulation.
+    """
     policy.condition(demonstration, task=task)
     config, reads_joints = policy.config, policy.algorithm.joints is not None
     scene = find_scene(config.scene)
     env = scene.simulate([task], batch_size=1, seed=seed, spread=config.spread)
+    if isinstance(env, RobotEnv):
+        env.close()
+        raise ValueError(
+            f"the scene {scene.name!r} is a physical robot, which commands do not move: let it act "
+            "in your own program (docs/deploy.md)"
+        )
     state, seen, views = env.reset(), [env.frames()[0]], [_view(env.simulations[0])]
     for _ in range(config.algorithm.max_steps):
         joints = state["joints"][0].numpy() if reads_joints else None

@@ -80,14 +80,14 @@ def _read_settings(path: Path) -> dict[str, Any]:
 
 
 def read_config(
-    path: str | Path, usual: Callable[[Any, Any], RunConfig] | None = None
+    path: str | Path, usual: Callable[[dict[str, Any]], RunConfig] | None = None
 ) -> tuple[RunConfig, Digests]:
     """Read the settings that `Trainer` wrote: the inverse of ``dataclasses.asdict``.
 
     Args:
         path: The ``config.json`` of a run, or another file of settings, YAML or JSON.
-        usual: Returns settings that the file may lack, from the algorithm's name and the scene that
-            stand there, or None for either; by default, they are those of the classes.
+        usual: Returns settings that the file may lack, given those that stand there; by default,
+            they are those of the classes.
 
     Returns:
         The settings, and the digests of the encoders and demonstrations.
@@ -99,7 +99,7 @@ def read_config(
     path = Path(path)
     settings = _read_settings(path)
     if usual is not None:
-        given = usual(settings.get("name"), settings.get("scene"))
+        given = usual(settings)
         settings = _merged(_as_json(asdict(given)), settings)
     try:
         return _of_settings(settings)
@@ -122,8 +122,9 @@ def _of_settings(settings: dict[str, Any]) -> tuple[RunConfig, Digests]:
         LookupError: If the scene or a task is unknown to this process.
         ValueError: If a setting is unknown or out of range; also ``TypeError``, ``AttributeError``.
     """
-    settings = dict(settings)
-    digests = Digests(*(settings.pop(name, None) for name in Digests._fields))
+    settings, digests = dict(settings), Digests(None, None)
+    if "algorithm_class" in settings:  # Of a run; in another file, they would be names of files.
+        digests = Digests(*(settings.pop(name, None) for name in Digests._fields))
     modules = settings.pop("task_modules", {})
     settings.pop("scene_version", None)  # `load_last` compares it
     kind = _algorithm_config(settings.get("name"), settings.pop("algorithm_class", None))

@@ -240,7 +240,13 @@ def test_the_command_keeps_the_names_of_the_tasks(tmp_path, encoders, monkeypatc
         folder, tasks=["push_again"], per_task=2, held_out_per_task=1, progress=False
     )
     monkeypatch.setattr(make_data, "load_representation", lambda path, scene: encoders)
-    make_data.bank(MakeBankArguments(dataset=folder, out=out))
+    arguments = MakeBankArguments(dataset=folder, out=out)
+    for _ in range(2):  # A bank may be made anew, another file is kept.
+        make_data.bank(arguments)
+    kept = tmp_path / "encoders.safetensors"
+    save_tensors(kept, {"weight": torch.zeros(2)}, {})
+    with pytest.raises(ValueError, match="is no bank, and is kept"):
+        make_data.bank(replace(arguments, out=kept))
     found = DemonstrationBank.load(out, encoder_id=encoders.identity)
     assert found.tasks == ("push_again",)
     assert found.task.tolist() == [0, 0]

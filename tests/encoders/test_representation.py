@@ -6,6 +6,7 @@ import warnings
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -312,6 +313,21 @@ def test_actions_of_any_size_are_learned_from_and_recorded_ones_are_used(tmp_pat
     assert not inferred.steps.action.equal(bank.steps.action)
     unknown = make_bank(trained, shown.exclude("action"), tasks=options["tasks"])
     assert unknown.steps.action.equal(inferred.steps.action)
+
+
+def test_recorded_actions_are_compared_with_inferred_ones_if_play_tells_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else, the inverse model has learned from these very actions."""
+    monkeypatch.setattr("bgpo_trl.encoders.train.mismatch", lambda *_: "actions are turned round")
+    shown = with_a_gripper(8)
+    robot = replace(scene(frame_shape=(32, 64), action_size=4), tasks=("left", "right", "up"))
+    options: dict[str, Any] = {"scene": robot, "tasks": robot.tasks, "progress": False}
+    for name, play in (("alone", None), ("play", shown)):
+        folder = tmp_path / name
+        with pytest.warns(UserWarning) as caught:
+            train_encoders(shown, play, folder / "weights", folder, TINY, **options)
+        assert any("turned" in str(w.message) for w in caught) == (play is not None)
 
 
 class Halving:

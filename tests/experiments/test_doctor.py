@@ -7,6 +7,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from PIL import Image
 
 from bgpo_trl.experiments import doctor
 from bgpo_trl.experiments.arguments import DoctorArguments
-from bgpo_trl.scenes import SCENES
+from bgpo_trl.scenes import SCENES, SimulationEnv
 from tests.scenes.dot import Dot, scene
 
 ROOT = Path(__file__).parents[2]
@@ -70,6 +71,14 @@ def test_a_robot_is_drawn_and_measured(tmp_path, monkeypatch, capsys, make, leve
     assert float(re.findall(r"(\d+) frames a second", found["dot"][1])[0]) > 0
     assert ("shadows" in found["dot"][1]) == (slow > 0)
     assert Image.open(tmp_path / "dot.png").size == (8 * 24, 8 * 16)
+
+
+def test_a_robot_that_cannot_be_tried_is_not_wrong(monkeypatch):
+    monkeypatch.setitem(SCENES, "dot", replace(scene(), make_env=None))
+    assert doctor.check_robot(DoctorArguments(scene="dot")) == "it has no simulation to try"
+    monkeypatch.setitem(SCENES, "dot", scene())
+    monkeypatch.setattr("bgpo_trl.scenes.RobotEnv", SimulationEnv)
+    assert "which is not moved" in doctor.check_robot(DoctorArguments(scene="dot"))
 
 
 def test_a_full_disk_is_wrong(tmp_path, monkeypatch):

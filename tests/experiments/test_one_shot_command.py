@@ -10,8 +10,10 @@ from PIL import Image
 import bgpo_trl
 from bgpo_trl.data.film import decode_frame, read_film
 from bgpo_trl.errors import UnreadableError
+from bgpo_trl.experiments import watch
 from bgpo_trl.experiments.arguments import OneShotArguments
 from bgpo_trl.experiments.watch import one_shot
+from bgpo_trl.scenes import SimulationEnv
 from tests.helpers import POINTER
 
 pytestmark = pytest.mark.usefixtures("easy_world")
@@ -55,11 +57,24 @@ def test_it_prints_what_the_policy_infers_and_plays_a_task(run_of, film):
     assert played.startswith((f"{task}: success after ", f"{task}: no success after "))
 
 
+def test_a_physical_robot_is_not_moved(run_of, film, monkeypatch):
+    monkeypatch.setattr(watch, "RobotEnv", SimulationEnv)
+    asked = OneShotArguments(run=run_of("bgpo"), demonstration=film, task="grasp_glass")
+    with pytest.raises(ValueError, match="'nico' is a physical robot, which commands do not move"):
+        one_shot(asked)
+
+
 def test_frames_are_read_exactly_in_the_order_of_names(film):
     np.testing.assert_array_equal([*read_film(film)], FRAMES)
     for number in range(len(FRAMES)):
         (film / f"{number:04}.png").rename(film / f"frame {number}.png")
     np.testing.assert_array_equal([*read_film(film)], FRAMES)  # 10 after 9, not after 1
+    for number in range(len(FRAMES)):  # by their time
+        (film / f"frame {number}.png").rename(film / f"{number / 20:.2f}.png")
+    np.testing.assert_array_equal([*read_film(film)], FRAMES)
+    (film / "0.10.png").rename(film / "0.1.png")  # the first, or the tenth?
+    with pytest.raises(UnreadableError, match=r"a point in its name.* number them"):
+        next(read_film(film))
 
 
 def test_images_are_upright_as_their_camera_says(tmp_path):

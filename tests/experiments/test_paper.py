@@ -18,6 +18,7 @@ import pytest
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis.comparison import NAMES
 from bgpo_trl.configs import RepresentationConfig
+from bgpo_trl.encoders.pretrained import default_weights
 from bgpo_trl.experiments import measure
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.experiments.arguments import Arguments
@@ -25,9 +26,10 @@ from bgpo_trl.experiments.measure import success_lines
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.experiments.run import concurrent, continual
 from bgpo_trl.files.checkpoint import load_checkpoint
+from bgpo_trl.runs.demonstrations import own_weights
 from bgpo_trl.runs.results import read_run, read_table
 from suites import nico
-from tests.helpers import Recorder, cells, contents, rows
+from tests.helpers import Recorder, cells, contents, edit, rows
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -120,6 +122,10 @@ def test_a_finished_run_is_only_changed_by_making_it_longer(
     for other in ({"episodes": 5}, seed, every, {"episodes": 9, **every}):
         changed = partial(continual, replace(again, **other))
         refused(changed, "holds a run with other settings", "choose another")
+    with_others = replace(again, episodes=9, encoders=default_weights())
+    refused(partial(continual, with_others), "--encoders: ", "was begun with the encoders")
+    trained = replace(again, episodes=9, train_encoders=True)
+    refused(partial(continual, trained), "--train-encoders: ", "leave the flag out")
     from_start = partial(concurrent, replace(again, episodes=9))
     refused(from_start, "task_starts is [0, 2, 4] there", "choose another")
 
@@ -128,7 +134,7 @@ def test_a_finished_run_is_only_changed_by_making_it_longer(
     assert (run / "final.csv").exists()
     assert (run / "train.csv").read_text() == played
 
-    continual(replace(again, episodes=9))
+    continual(replace(again, episodes=9, encoders=own_weights(run)))
     config = json_of(run, "config")
     kept = (config["episodes"], config["task_starts"], config["eval_every"])
     assert kept == (9, [0, 2, 4], 2)
@@ -159,10 +165,17 @@ def test_a_run_is_continued_and_repeated_with_its_own_settings(
     assert json_of(run, "summary")["changed"] == {"beta": 0.3}
 
     again = tmp_path / "again"
-    continual(Arguments(out=again, config=run))
+    with monkeypatch.context() as patch:  # encoders and demonstrations are the run's, too
+        patch.delattr(experiment, "load_pretrained")
+        continual(Arguments(out=again, config=run))
     assert (again / "config.json").read_bytes() == (run / "config.json").read_bytes()
     repeated, extended = ((path / "train.csv").read_text().split("\n") for path in (again, run))
     assert sorted(repeated) == sorted(extended)  # in which episodes played early are logged late
+    fewer = Arguments(out=tmp_path / "fewer", config=run, tasks=TASKS[:2])
+    refused(partial(continual, fewer), "has the tasks", "--bank")
+    edit(run / "config.json", logged="ab")
+    other = Arguments(out=tmp_path / "other", config=run)
+    refused(partial(continual, other), "began with logged episodes", "--logged")
 
 
 def test_the_directory_is_locked_from_the_encoders_to_the_figures(
@@ -299,6 +312,8 @@ def test_a_task_is_added_to_a_finished_run_and_reported(undrawn, tmp_path, encod
     assert set(tests["task"]) == {*TASKS, "lift_green"}
     assert json_of(run, "config")["tasks"] == [*TASKS, "lift_green"]
     assert json_of(run, "config")["task_starts"][-1] > 6
+    (run / "summary.json").unlink()  # as if it had been interrupted in its last tests
+    assert "curve and figures" in continual(command)
     for again in (command, Arguments(out=run, resume=True)):
         assert "is finished, all 16 episodes" in continual(again)
 

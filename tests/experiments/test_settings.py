@@ -92,8 +92,22 @@ def test_a_file_changes_the_preset_and_flags_change_the_file(tmp_path):
     changed = replace(expected, eval_every=9, algorithm=replace(algorithm, beta=0.7))
     assert run_config(flags) == changed
     assert run_config(replace(of_file, algorithm="bgpo-single")) == expected  # named once more
-    other = run_config(replace(of_file, algorithm="maml"))
-    assert (other.name, other.algorithm) == ("maml", ALGORITHMS["maml"].config)
+    with pytest.raises(ValueError, match=r"--algorithm maml: .* hyperparameters of bgpo-single"):
+        run_config(replace(of_file, algorithm="maml"))
+    del content["name"]
+    path.write_text(json.dumps(content))
+    assert run_config(replace(of_file, algorithm="bgpo-single")) == expected
+
+
+def test_a_file_that_gives_length_or_tasks_alone_gets_starts_that_fit(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("episodes: 1000")
+    assert run_config(Arguments(config=path)) == run_config(Arguments(episodes=1_000))
+    path.write_text(f"episodes: 100\ntasks: [{ONE}, {TWO}]")
+    assert run_config(Arguments(config=path)).task_starts == (0, 50)
+    late = Arguments(episodes=12, settings=("--task-starts", "0", "5", "12"))
+    with pytest.raises(ValueError, match="task_starts must be below the 12 episodes"):
+        run_config(late)
 
 
 def test_a_file_may_name_the_scene_whose_tasks_and_length_are_then_the_usual_ones(
@@ -111,7 +125,7 @@ def test_a_file_may_name_the_scene_whose_tasks_and_length_are_then_the_usual_one
         assert of_file.tasks == SCENES["dot"].default_tasks
         path.write_text(f"scene: dot\n{content}")
         other = run_config(Arguments(config=path, algorithm="clone")).algorithm
-        assert other == replace(ALGORITHMS["clone"].config, max_steps=12)
+        assert other == replace(ALGORITHMS["clone"].config, max_steps=length)
 
 
 def test_a_file_sets_what_encoders_train_with_and_flags_change_the_file(tmp_path):
@@ -171,6 +185,7 @@ def test_yaml_json_and_flags_store_the_same_settings(tmp_path):
     [
         ("mine.yaml", "seeds: [0, 1\nepisodes: 5", "line 2"),
         ("mine.yaml", "- seeds", "name: value"),
+        ("mine.yaml", "bank: own.safetensors", "unknown setting bank"),
         ("mine.yaml", "tasks: &all [*all]", "unhashable"),
         (
             "mine.yaml",
