@@ -97,7 +97,7 @@ class LoadedRun:
             encoders=encoders,
             scene=find_scene(config.scene),
         )
-        if not algorithm.needs_replay and "replay" in state:
+        if not algorithm.needs_replay and hasattr(algorithm, "replay"):
             state = {**state, "replay": algorithm.replay.state_dict()}  # avoids reading it
         algorithm.load_state_dict(state)
         return cls(config, algorithm, encoders, bank, episodes)

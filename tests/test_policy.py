@@ -17,6 +17,7 @@ from bgpo_trl import training
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.representation import save_representation
+from bgpo_trl.policy import LoadedRun
 from bgpo_trl.runs.config_file import settings_of
 from bgpo_trl.scenes.nico import NICO
 from bgpo_trl.training import Trainer
@@ -258,6 +259,28 @@ def test_a_pickled_policy_acts_as_before_and_can_be_conditioned_anew(load, name)
         assert (other.act(frame) == policy.act(frame)).all()
         kept = ("seed", "episodes", "tasks")
         assert [getattr(other, name) for name in kept] == [getattr(policy, name) for name in kept]
+
+
+class Remembered:
+    """An own algorithm without a replay."""
+
+    needs_replay = False
+
+    def __init__(self, config, **parts):
+        self.state = {}
+
+    def state_dict(self):
+        return dict(self.state)
+
+    def load_state_dict(self, state):
+        self.state = state
+
+
+def test_an_algorithm_without_a_replay_is_loaded_and_pickled(make_config, encoders, bank):
+    learned = {"weight": torch.ones(2)}
+    run = LoadedRun.restore(Remembered, make_config(), learned, encoders, bank, [3])
+    for loaded in (run, pickle.loads(pickle.dumps(run))):
+        assert loaded.algorithm.state["weight"].equal(learned["weight"])
 
 
 @every_kind
