@@ -152,7 +152,7 @@ class Trainer:
             self._make_parts(bank, make, device)
             if saved is not None:
                 self._check_added_tasks(saved, bank)
-                self.world.check_state(saved["world"])
+                self.world.check_state(saved.get("world", {}))
                 with fitting_checkpoint(self.directory):
                     self._load(saved)
                 if encoders is not None:  # before config.json names tasks that may be added

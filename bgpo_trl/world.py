@@ -75,7 +75,7 @@ class World:
 
     def check_state(self, state: dict[str, Any]) -> None:
         """Raise ``ValueError`` unless a `state_dict` holds the state of the simulations."""
-        if state["simulation"] is None:
+        if state.get("simulation", state) is None:
             raise ValueError(
                 f"simulations of the scene {self._scene.name!r} cannot be saved, so this run "
                 "cannot be resumed: begin another one, or define save and load of its Simulation"

@@ -60,10 +60,11 @@ def test_rows_count_up_to_the_episode_that_all_runs_have_reached(tmp_path, monke
 
 
 def test_arms_of_one_algorithm_are_told_apart_by_their_folders(tmp_path):
-    for arm, settings in (("slow", {"beta": 0.1}), ("without-bonus", {"beta": 0.0})):
-        write(tmp_path, arm, 0, 100, 0.5)
-        changed = {"name": "slow", "algorithm": settings, "episodes": len(arm)}
-        edit(tmp_path / f"{arm}-0" / "config.json", **changed)
+    for arm, settings in (("without-bonus", {"beta": 0.0}), ("slow", {"beta": 0.1})):
+        write(tmp_path, "slow", 0, 100, 0.5)
+        changed = {"algorithm": settings, "episodes": 100 + len(arm)}
+        edit(tmp_path / "slow-0" / "config.json", **changed)
+        (tmp_path / "slow-0").rename(tmp_path / f"{arm}-0")
     runs, reached = paper_claims.runs_of(tmp_path)
     assert [*runs] == ["slow", "without-bonus"]
     assert reached == 100
