@@ -1,6 +1,7 @@
 """Hyperparameters without a meaning are refused where they are made."""
 
 import math
+from contextlib import nullcontext
 from dataclasses import asdict
 
 import numpy as np
@@ -137,3 +138,16 @@ def test_config_files_hold_every_number_that_acts():
     assert None not in asdict(RunConfig()).values()
     of_bank = {"demonstration_noise"}  # whose digest the run holds
     assert {name for name, value in asdict(BGPOConfig()).items() if value is None} == of_bank
+
+
+@pytest.mark.parametrize(
+    ("critics", "policy_delay", "missed"),
+    [(4, 1, False), (3, 2, False), (5, 2, False), (4, 2, True), (3, 3, True), (10, 9, True)],
+)
+def test_a_critic_that_the_actor_would_never_see_is_refused(critics, policy_delay, missed):
+    with (
+        pytest.raises(ValueError, match="critics must be a number of which")
+        if missed
+        else (nullcontext())
+    ):
+        RLConfig(critics=critics, policy_delay=policy_delay)

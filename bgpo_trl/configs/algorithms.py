@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import combinations
 from math import inf
 from typing import Literal
 
@@ -106,9 +107,18 @@ class RLConfig(Settings):
         # With a smaller replay, learning would never begin.
         least = max(self.batch_size, self.warmup_steps)
         sizes = min(self.hidden_sizes, default=0) >= 1
+        # By turns, of which the actor sees one in `policy_delay` (`DDPGLoss.pair`).
+        pairs = [*combinations(range(self.critics), 2)] or [(0, 0)]
+        turns = range(0, len(pairs) * self.policy_delay, self.policy_delay)
+        seen = {critic for turn in turns for critic in pairs[turn % len(pairs)]}
         check(
             self,
             ("critics", self.critics > 1 or self.proposals != "both", "2 or more to choose"),
+            (
+                "critics",
+                len(seen) == self.critics,
+                f"a number of which the actor sees all, with a policy_delay of {self.policy_delay}",
+            ),
             ("hidden_sizes", sizes, "one or more whole numbers, of at least 1"),
             ("gamma", 0 <= self.gamma <= 1, "between 0 and 1"),
             ("tau", 0 < self.tau <= 1, "above 0 and at most 1"),
