@@ -67,15 +67,14 @@ class World:
         return {"source": dict(self.source.state_dict()), "simulation": simulation}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a `state_dict`."""
-        self.check_state(state)
+        """Restore a `state_dict` that `check_state` accepts."""
         self.env.reset()  # Transforms create their caches at the first reset.
         self.source.load_state_dict(state["source"])
         self.simulation.load_simulation_state(state["simulation"])
 
     def check_state(self, state: dict[str, Any]) -> None:
         """Raise ``ValueError`` unless a `state_dict` holds the state of the simulations."""
-        if state.get("simulation", state) is None:
+        if "simulation" in state and state["simulation"] is None:
             raise ValueError(
                 f"simulations of the scene {self._scene.name!r} cannot be saved, so this run "
                 "cannot be resumed: begin another one, or define save and load of its Simulation"

@@ -114,11 +114,11 @@ class Experts:
         self, learner: Learner, active: ActiveGroups, parent: Callable[[int, int], int]
     ) -> None:
         self.learner, self.active, self._parent = learner, active, parent
-        # By seed: whose expert is in each slot, and the experts put aside.
-        self._placed: list[list[int]] = [[] for _ in active.groups]
-        self._inactive: list[dict[int, Expert]] = [{} for _ in active.groups]
-        # By seed, the expert that none has trained: that of group 0 until it is played.
-        self._initial = [learner.read(seed, 0) for seed in range(len(active.groups))]
+        # By seed: whose expert is in each slot, and the experts put aside. As group 0 need not be
+        # the first to play, its expert waits there.
+        seeds = range(len(active.groups))
+        self._placed: list[list[int]] = [[] for _ in seeds]
+        self._inactive: list[dict[int, Expert]] = [{0: learner.read(seed, 0)} for seed in seeds]
 
     def play(self, groups: Sequence[int]) -> Tensor:
         """Activate the group of each seed's episode; return its slots, int64 ``[S]``."""
@@ -134,20 +134,14 @@ class Experts:
         self._arrange()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the active groups, the experts put aside, and the initial ones."""
-        inactive = [{**row} for row in self._inactive]
-        return {
-            "active": self.active.state_dict(),
-            "inactive": inactive,
-            "initial": [*self._initial],
-        }
+        """Return the active groups, and the experts put aside."""
+        return {"active": self.active.state_dict(), "inactive": [{**row} for row in self._inactive]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a `state_dict`; the learner, whose ``E`` changes, is restored next."""
         self.active.load_state_dict(state["active"])
         self._placed = [[*groups] for groups in self.active.groups]
         self._inactive = [{**row} for row in state["inactive"]]
-        self._initial = [*state["initial"]]
         self.learner.resize(self.active.group.shape[1])
 
     def _arrange(self) -> None:
@@ -175,18 +169,13 @@ class Experts:
         return {"networks": networks, "moments": {}}
 
     def find(self, seed: int, group: int) -> Expert:
-        """Return the expert of a group, or of its nearest ancestor that has one (has played).
-
-        If none has played, it is the initial one.
-        """
+        """Return the expert of a group, or of its nearest ancestor that has played, or group 0."""
         inactive, placed = self._inactive[seed], self._placed[seed]
         while group and group not in inactive and group not in placed:
             group = self._parent(seed, group)
         if group in inactive:
             return inactive[group]
-        if group in placed:
-            return self.learner.read(seed, placed.index(group))
-        return self._initial[seed]
+        return self.learner.read(seed, placed.index(group))
 
 
 def _moved(one: list[list[int]], other: list[list[int]]) -> list[tuple[int, int, int]]:

@@ -330,6 +330,24 @@ def test_recorded_actions_are_compared_with_inferred_ones_if_play_tells_them(
         assert any("turned" in str(w.message) for w in caught) == (play is not None)
 
 
+def test_a_folder_is_locked_while_encoders_are_trained_in_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else, two trainings would mix their rows and their checkpoints."""
+    locked = []
+
+    def fit(*_: Any, **__: Any) -> None:
+        locked.append((tmp_path / "fit" / "lock").exists())
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("bgpo_trl.encoders.train.train_representation", fit)
+    robot = replace(scene(frame_shape=(32, 64), action_size=4), tasks=("left", "right", "up"))
+    parts = (with_a_gripper(8), None, tmp_path / "weights", tmp_path / "fit", TINY)
+    with pytest.raises(KeyboardInterrupt):
+        train_encoders(*parts, tasks=robot.tasks, scene=robot, progress=False)
+    assert locked == [True]
+
+
 class Halving:
     """A frame encoder that reconstructs half of the deviation from the mean frame."""
 

@@ -1,5 +1,7 @@
 """The encoders against plain references: of frames, of sequences, and of actions."""
 
+from copy import deepcopy
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -176,6 +178,8 @@ def test_the_actions_of_an_episode_are_those_of_its_windows(model: InverseModel)
     z, length = torch.randn(2, 5, 3, generator=generator), torch.tensor([5, 3])
     action = model(z, length)
     assert action.shape == (2, 4, 2)
+    elsewhere = deepcopy(model).to("meta")(z.to("meta"), length.to("meta"))
+    assert elsewhere.shape == action.shape and elsewhere.is_meta
     for episode, step in [(0, 0), (0, 3), (1, 1)]:
         alone = model.network(window(z, length, torch.tensor(episode), torch.tensor(step)))
         torch.testing.assert_close(action[episode, step], alone.clamp(-1.0, 1.0))

@@ -2,6 +2,7 @@
 
 import copy
 import math
+import pickle
 
 import pytest
 import torch
@@ -284,10 +285,13 @@ def test_a_copied_or_cast_loss_still_follows_its_parameters(name, change):
 
 
 @every_loss
-def test_targets_follow_by_a_share_also_after_a_cast(name):
+@pytest.mark.parametrize("pickled", [False, True])
+def test_targets_follow_by_a_share_also_after_a_cast(name, pickled):
     loss = make_loss(name)
     update = ForeachSoftUpdate(loss, tau=0.1)
     loss.double()
+    if pickled:
+        loss, update = pickle.loads(pickle.dumps((loss, update)))
     before = [target.clone() for target in targets_of(loss)]
     for parameter in loss.parameters():
         parameter.data.add_(1.0)
