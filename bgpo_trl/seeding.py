@@ -6,6 +6,7 @@ import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Integral
+from operator import index
 from typing import Any
 
 import numpy as np
@@ -49,7 +50,7 @@ def row_seeds(seed: int | Iterable[int] | None, count: int) -> list[int]:
     if seed is None:
         return np.random.SeedSequence().generate_state(count).tolist()
     counted = isinstance(seed, (int, Integral))
-    seeds = [int(seed)] if counted else [int(each) for each in seed]
+    seeds = [index(seed)] if counted else [index(each) for each in seed]
     if not counted and len(seeds) != count:
         raise ValueError(f"{len(seeds)} seeds for {count} simulations: give one each")
     if not all(0 <= each < 2**32 for each in seeds):

@@ -52,7 +52,7 @@ def bank(n=6, tasks=3, value=0.1):
 
 
 def world(*transforms, observation="state", **options):
-    env = NicoEnv(observation=observation, **options)
+    env = NicoEnv(observation=observation, seed=0, **options)
     return TransformedEnv(env, Compose(StepCounter(50), *transforms))
 
 
@@ -61,7 +61,7 @@ def source(**options):
 
 
 def step_with(action):
-    env = NicoEnv(observation="state")
+    env = NicoEnv(observation="state", seed=0)
     state = env.reset()
     return env.step(state if action is None else state.set("action", action))
 

@@ -16,6 +16,7 @@ from bgpo_trl.encoders.fitting import train_representation
 from bgpo_trl.encoders.mismatch import doubt_frames
 from bgpo_trl.encoders.representation import load_representation, save_representation
 from bgpo_trl.modules.frame_network import FRAME_NETWORKS, FrameNetwork
+from bgpo_trl.scenes.nico import NicoEnv
 from tests.helpers import TINY_ENCODERS, rows
 from tests.second_device import second_device
 
@@ -45,6 +46,20 @@ def test_colors_are_doubted_wherever_the_network_is(device, encoders):
     frames = torch.randint(256, (3, 32, 64, 3), generator=torch.Generator().manual_seed(0))
     network, frames = deepcopy(encoders.frame_network), frames.to(torch.uint8)
     assert doubt_frames(network.to(device), frames) == doubt_frames(encoders.frame_network, frames)
+
+
+def test_an_environment_may_be_moved(device):
+    seen = []
+    for place in ("cpu", device):
+        env = NicoEnv(batch_size=[2], seed=0, observation="state").to(place)
+        state = env.reset(TensorDict({"task": torch.tensor([1, 2])}, [2], device=place))
+        given = {"action": torch.full((2, 4), 0.5), "_step": torch.tensor([True, False])}
+        after = env.step(state.update(TensorDict(given, [2], device=place)))["next"]
+        again = TensorDict({"_reset": torch.tensor([[True], [False]])}, [2], device=place)
+        again = env.reset(after.update(again))
+        assert {entry.device for entry in (*after.values(), *again.values())} == {env.device}
+        seen.append(torch.stack([after["state"], again["state"]]).cpu())
+    assert torch.equal(*seen)
 
 
 @pytest.mark.usefixtures("easy_world")

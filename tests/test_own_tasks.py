@@ -27,6 +27,19 @@ def added():
     nico.add_task("at_once", AtOnce)
 
 
+class TooFar(nico.NicoTask):
+    """No success: episodes end after two steps as failures, with a reward for each step."""
+
+    def succeeded(self, physics):
+        return False
+
+    def get_reward(self, physics):
+        return super().get_reward(physics) - 0.5
+
+    def get_termination(self, physics):
+        return 0.0 if physics.time() > 0.3 else super().get_termination(physics)
+
+
 def bank_of(*tasks, n=6):
     """Return a bank whose embeddings are the number of the task and of the demonstration."""
     task = torch.arange(len(tasks)).repeat_interleave(n)
@@ -41,13 +54,30 @@ def test_an_added_task_can_be_loaded_by_name():
     timestep = env.step(np.zeros(4))
     assert (timestep.last(), timestep.reward, timestep.discount) == (True, 1.0, 0.0)
 
-    batch = NicoEnv(("grasp_glass", "at_once"), batch_size=[2], observation="state")
+    batch = NicoEnv(("grasp_glass", "at_once"), batch_size=[2], observation="state", seed=0)
     state = batch.reset(TensorDict({"task": torch.tensor([0, 1])}, [2]))
     state = batch.step(state.set("action", torch.zeros(2, 4)))["next"]
     assert state["terminated"].flatten().tolist() == [False, True]
     assert state["reward"].flatten().tolist() == [0, 1]
     rate = evaluate_random_policy(tasks=("grasp_glass", "at_once"), episodes=3, max_steps=2)
     assert rate.tolist() == [0, 1]
+
+
+def test_a_task_may_end_episodes_without_success_and_reward_each_step():
+    nico.add_task("too_far", TooFar)
+    short, failing = (
+        nico.load("too_far", seed=0, time_limit=t, observation="state") for t in (0.2, 9)
+    )
+    for env, discounts in ((short, [1.0]), (failing, [1.0, 0.0])):
+        env.reset()
+        timesteps = [env.step(np.zeros(4)) for _ in discounts]
+        assert [(t.reward, t.discount) for t in timesteps] == [(-0.5, d) for d in discounts]
+        assert timesteps[-1].last()
+
+    batch = NicoEnv(["too_far"], observation="state", seed=0)
+    after = batch.rollout(5)["next"]
+    assert after["terminated"].flatten().tolist() == [False, True]
+    assert not after["success"].any() and not after["reward"].any()
 
 
 def test_bad_names_and_classes_of_tasks_are_refused():

@@ -23,3 +23,6 @@ def test_rows_have_the_seeds_given_count_up_from_one_or_have_fresh_ones():
     for wrong in (-1, 2**32, [0, -1], [2**32, 0]):
         with pytest.raises(ValueError, match="a seed must lie in"):
             row_seeds(wrong, 2)
+    for wrong in (1.5, [1.5, 2.0]):
+        with pytest.raises(TypeError):
+            row_seeds(wrong, 2)

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from dm_env import TimeStep
 from numpy.typing import NDArray
 
 from bgpo_trl.scenes.scene import Observation, Outcome, Scene, Simulation, StateColumns
@@ -57,7 +56,6 @@ class NicoSimulation(Simulation):
             for task in tasks
         }
         self.task = tasks[0]
-        self.timestep: TimeStep
         self._room: FrameRenderer | None = None
 
     @property
@@ -72,11 +70,12 @@ class NicoSimulation(Simulation):
     def reset(self, task: str) -> None:
         """Begin an episode of a task."""
         self.task = task
-        self.timestep = self.environment.reset()
+        self.environment.reset()
 
     def step(self, action: NDArray[np.float64]) -> Outcome:
-        """Perform an action ``[4]``; an episode ends with success only."""
-        return Outcome(self.environment.advance(action))
+        """Perform an action ``[4]``; without success, an episode ends only if its task says so."""
+        solved, ends = self.environment.advance(action)
+        return Outcome(solved, failure=ends and not solved)
 
     def frame(self) -> NDArray[np.uint8]:
         """Return NICO's view, ``[32, 64, 3]``."""
@@ -132,7 +131,8 @@ class NicoEnv(SimulationEnv):
 
     ``"pixels"`` are ``[*B, 32, 64, 3]``, ``"joints"`` ``[*B, 4]`` (rad), ``"state"`` ``[*B, 16]``:
     joints, grip and object positions (m). Actions are ``[*B, 4]``. All simulations share one
-    renderer. Episodes end on success only: append ``StepCounter(50)`` for the paper's time limit.
+    renderer, which draws the looks of the first one's model. Episodes end on success only: append
+    ``StepCounter(50)`` for the paper's time limit.
 
     Args:
         tasks: Names of the tasks, in the order of their presentation.
@@ -190,7 +190,7 @@ def _demonstrator(simulation: Simulation, task: str, seed: int) -> Callable[[], 
         raise TypeError(f"NICO's demonstrator acts in a NicoSimulation, got {simulation!r}")
     demonstrator = Demonstrator(simulation.environments[task], seed=seed)
     demonstrator.reset()
-    return lambda: demonstrator(simulation.timestep)
+    return demonstrator
 
 
 def _objects_on_table(state: torch.Tensor) -> torch.Tensor:

@@ -371,7 +371,7 @@ class Scene:
         tasks: Sequence[str],
         *,
         batch_size: int | Sequence[int] = (),
-        seed: int | Sequence[int] | None = 0,
+        seed: int | Sequence[int] | None = None,
         spread: float = 1.0,
         observation: Observation = "pixels",
     ) -> SimulationEnv:

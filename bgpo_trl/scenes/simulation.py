@@ -79,7 +79,7 @@ class SimulationEnv(EnvBase):
         state_size: int | None = None,
         joint_size: int | None = None,
         batch_size: int | Sequence[int] = (),
-        seed: int | Sequence[int] | None = 0,
+        seed: int | Sequence[int] | None = None,
         observation: Observation = "pixels",
         threads: int | None = None,
     ) -> None:
@@ -166,7 +166,7 @@ class SimulationEnv(EnvBase):
         if tensordict is not None:
             reset = tensordict.get("_reset", None)
             if reset is not None:
-                rows = reset.reshape(-1).numpy()
+                rows = reset.reshape(-1).cpu().numpy()
             task = tensordict.get("task", None)
             if task is not None:
                 if task.is_floating_point() or task.shape.numel() != len(rows):
@@ -174,7 +174,7 @@ class SimulationEnv(EnvBase):
                         f"task must be a whole number for each of {len(rows)} simulations, got "
                         f"{task.dtype} {[*task.shape]}"
                     )
-                chosen = task.reshape(-1).numpy()
+                chosen = task.reshape(-1).cpu().numpy()
                 if ((chosen < 0) | (chosen >= len(self.tasks)))[rows].any():
                     raise ValueError(
                         f"task must lie in 0..{len(self.tasks) - 1}, got {chosen.tolist()}"
@@ -183,6 +183,8 @@ class SimulationEnv(EnvBase):
         for row in np.flatnonzero(rows).tolist():
             self.simulations[row].reset(self.tasks[self._task[row]])
             self._record(row)
+        if "executed_action" in self._current:
+            self._current["executed_action"][rows] = 0.0
         self._begun |= rows
         self._success[rows] = self._failure[rows] = False
         # With the device, TorchRL does not copy all entries at each step.
@@ -192,7 +194,7 @@ class SimulationEnv(EnvBase):
         rows = ~(self._success | self._failure)
         steps = tensordict.get("_step", None)
         if steps is not None:
-            rows = rows & steps.reshape(-1).numpy()
+            rows = rows & steps.reshape(-1).cpu().numpy()
         action = tensordict.get("action", None)
         if action is None:
             raise missing_key(type(self).__name__, tensordict, ["action"])
@@ -201,7 +203,7 @@ class SimulationEnv(EnvBase):
             raise ValueError(f"actions must be {[*self.batch_size, size]}, got {[*action.shape]}")
         if not self._begun[rows].all():
             raise ValueError("there is no episode to step in: reset the environment first")
-        actions = action.detach().reshape(-1, size).double().numpy()
+        actions = action.detach().reshape(-1, size).double().cpu().numpy()
         # Checked for all before any of them moves.
         if not np.isfinite(actions[rows]).all():
             raise ValueError(
@@ -231,7 +233,11 @@ class SimulationEnv(EnvBase):
             else:
                 check_executed(outcome, asked[row])
 
-        self._threads.each(asked, step, record)
+        try:
+            self._threads.each(asked, step, record)
+        except BaseException:
+            self._begun[[*asked]] = False  # some have moved, and their outcome is lost
+            raise
 
     def frames(self) -> np.ndarray:
         """Return a copy of the frames that were drawn last, uint8 ``[*B, H, W, 3]``.
@@ -273,6 +279,7 @@ class SimulationEnv(EnvBase):
             NotImplementedError: If the simulation cannot be saved.
         """
         return {
+            "tasks": self.tasks,
             "simulations": [simulation.save() for simulation in self.simulations],
             "current": {key: torch.from_numpy(v.copy()) for key, v in self._current.items()},
             **{key: torch.from_numpy(v.copy()) for key, v in self._arrays().items()},
@@ -287,11 +294,11 @@ class SimulationEnv(EnvBase):
         if (
             len(state["simulations"]) != len(self.simulations)
             or state["current"].keys() != self._current.keys()
-            or int(state["task"].max()) >= len(self.tasks)
+            or self.tasks[: len(state["tasks"])] != tuple(state["tasks"])
         ):
             raise ValueError(
                 "the state was saved with another number of simulations, another kind of "
-                "observation or more tasks: use the same as it has"
+                "observation or other tasks: use the same as it has"
             )
         for simulation, saved in zip(self.simulations, state["simulations"], strict=True):
             simulation.load(saved)

@@ -69,7 +69,7 @@ def nominal_places() -> np.ndarray:
 
 
 class Environment(control.Environment):
-    """``control.Environment`` that gives a success on the last step discount 0, too."""
+    """``control.Environment`` whose last step has the discount of a termination, too."""
 
     def observation_spec(self) -> Mapping[str, specs.Array]:
         """Return the specs of the observation, flattened if the observation is."""
@@ -83,19 +83,20 @@ class Environment(control.Environment):
     def step(self, action: np.ndarray) -> TimeStep:
         """Advance one control step of 0.2 s."""
         timestep = super().step(action)
-        if timestep.last() and timestep.reward:
-            return timestep._replace(discount=0.0)
+        if timestep.last() and (discount := self.task.get_termination(self.physics)) is not None:
+            return timestep._replace(discount=discount)
         return timestep
 
-    def advance(self, action: np.ndarray) -> bool:
-        """Advance one control step of an episode; return whether the task is solved.
+    def advance(self, action: np.ndarray) -> tuple[bool, bool]:
+        """Advance one control step of an episode; return whether the task is solved, and ends.
 
         It observes nothing, for those who draw frames and read states themselves.
         """
         self.task.before_step(action, self.physics)
         self.physics.step(self._n_sub_steps)
         self.task.after_step(self.physics)
-        return self.task.get_termination(self.physics) is not None
+        ends = self.task.get_termination(self.physics) is not None
+        return self.task.solved(self.physics), ends
 
     def close(self) -> None:
         """Free the renderer, unless it is shared; the next frame creates a new one."""
@@ -288,21 +289,32 @@ class NicoTask(control.Task):
         """Return new arrays: ``pixels`` uint8 ``[H, W, 3]``, ``privileged_state`` ``[16]``."""
         observation: OrderedDict[str, np.ndarray] = OrderedDict()
         if self._observation != "state":
-            if self._renderer is None:
+            model = physics.model.ptr
+            if self._renderer is None or not (
+                self._shares_renderer or self._renderer.model is model
+            ):
+                self.close()
                 height, width = self._frame_size
-                self._renderer = FrameRenderer(physics.model.ptr, height=height, width=width)
+                self._renderer = FrameRenderer(model, height=height, width=width)
             observation["pixels"] = self._renderer.render(physics.data.ptr)
         if self._observation != "pixels":
             observation["privileged_state"] = physics.privileged_state()
         return observation
 
+    def solved(self, physics: Physics) -> bool:
+        """Return whether `succeeded` has held for `steady_steps` steps."""
+        return physics.steady_steps >= self.steady_steps
+
     def get_reward(self, physics: Physics) -> float:
-        """Return 1 if `succeeded` has held for `steady_steps` steps, else 0."""
-        return float(physics.steady_steps >= self.steady_steps)
+        """Return 1 if the task is `solved`, else 0."""
+        return float(self.solved(physics))
 
     def get_termination(self, physics: Physics) -> float | None:
-        """Return discount 0 if `succeeded` has held for `steady_steps` steps, else ``None``."""
-        return 0.0 if physics.steady_steps >= self.steady_steps else None
+        """Return discount 0 if the task is `solved`, else ``None``.
+
+        A subclass may end episodes otherwise, too, which counts as a failure.
+        """
+        return 0.0 if self.solved(physics) else None
 
     def close(self) -> None:
         """Free the renderer if it was created on demand."""

@@ -21,7 +21,8 @@ _TREMOR = 0.06  # standard deviation of noise on the action
 class Demonstrator:
     """Scripted policy for the task of an environment.
 
-    Call ``reset()`` after each ``env.reset()``, then ``demonstrator(timestep)`` for each action.
+    Call ``reset()`` after each ``env.reset()``, then ``demonstrator(timestep)`` for each action. It
+    reads the simulation; the time step may be left out.
 
     Args:
         env: A NICO environment, whose task defines the demonstration.
@@ -58,10 +59,11 @@ class Demonstrator:
         self._phases: list[Phase] = []
         self._speed = 0.0
         self._steps = 0  # of the current phase
+        self._time = 0.0  # (s) of the latest action
 
     def reset(self) -> None:
         """Plan a new demonstration from the current state of the environment."""
-        self._speed = self._random.uniform(*_SPEED)
+        self._speed, self._time = self._random.uniform(*_SPEED), self._physics.time()
         self._plan()
 
     def _plan(self) -> None:
@@ -72,15 +74,16 @@ class Demonstrator:
         self._phases = [Phase(lambda _: lifted, FIST / 2), *plan]
         self._steps = 0
 
-    def __call__(self, timestep: TimeStep) -> np.ndarray:
+    def __call__(self, timestep: TimeStep | None = None) -> np.ndarray:
         """Return the next action, ``[4]`` in [-1, 1].
 
         Raises:
-            RuntimeError: If ``reset()`` was not called first.
+            RuntimeError: If ``reset()`` was not called first, or not in this episode.
         """
-        if not self._phases:
-            raise RuntimeError("call the demonstrator's reset() after the environment's reset()")
         physics, targets = self._physics, self._physics.data.ctrl[:4]
+        if not self._phases or physics.time() < self._time:
+            raise RuntimeError("call the demonstrator's reset() after the environment's reset()")
+        self._time = physics.time()
         arm = self._phases[0].place(physics) - targets[:3]
         while self._ends(arm):
             self._phases.pop(0)

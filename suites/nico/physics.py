@@ -6,7 +6,7 @@
 import itertools
 from functools import cached_property
 from importlib import resources
-from typing import Final
+from typing import Any, Final
 
 import mujoco
 import numpy as np
@@ -37,6 +37,11 @@ class Physics(dm_mujoco.Physics):
     """
 
     # Indices are cached, since a lookup by `named` takes much longer than the read itself.
+
+    def _reload_from_data(self, data: Any) -> None:
+        for name in ("_arm", "_curls", "_ids", "_hand", "actuated_limits"):
+            vars(self).pop(name, None)
+        super()._reload_from_data(data)
 
     @cached_property
     def _arm(self) -> list[int]:
@@ -168,7 +173,7 @@ class Physics(dm_mujoco.Physics):
         mujoco.mj_forward(self.model.ptr, self.data.ptr)
 
     def gap(self, first: str, second: str) -> float:
-        """Return the smallest distance between two things (m); negative if they overlap.
+        """Return the smallest distance between two things (m), at most 1; negative if they overlap.
 
         Args:
             first: An object, ``"table"``, ``"hand"`` (palm, wrist and digits) or any other geom.

@@ -132,6 +132,9 @@ class FrameRenderer:
     Raises:
         RuntimeError: If no OpenGL context can be made; the message names the remedy.
         ValueError: If the scene has no such camera, or cannot render frames of that size.
+
+    Attributes:
+        model: The compiled scene whose looks are drawn, whatever simulation's data is rendered.
     """
 
     def __init__(
@@ -159,7 +162,7 @@ class FrameRenderer:
                 _leave()
         except Exception as error:  # MuJoCo's backends raise many kinds of errors.
             raise RuntimeError(opengl.explain(error)) from error
-        self._model, self._camera_name = model, camera
+        self.model, self._camera_name = model, camera
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._camera.fixedcamid = camera_id
@@ -170,7 +173,7 @@ class FrameRenderer:
     def __reduce__(self) -> tuple[Callable[..., FrameRenderer], tuple[mujoco.MjModel, str]]:
         height, width = self.frame_size
         make = functools.partial(FrameRenderer, height=height, width=width)
-        return make, (self._model, self._camera_name)
+        return make, (self.model, self._camera_name)
 
     def render(self, data: mujoco.MjData) -> np.ndarray:
         """Return an RGB frame of a simulation's state, uint8 ``[height, width, 3]``."""

@@ -89,8 +89,8 @@ def test_a_copy_continues_as_the_original(duplicate):
 
 
 def test_a_partial_reset_does_not_change_other_rows():
-    env = NicoEnv(batch_size=[3], observation="both")
-    undisturbed = NicoEnv(batch_size=[3], observation="both")
+    env = NicoEnv(batch_size=[3], observation="both", seed=0)
+    undisturbed = NicoEnv(batch_size=[3], observation="both", seed=0)
     steps = actions(env, 6)
     before = run(env, env.reset(), steps[:3])[-1].exclude("reward")
     run(undisturbed, undisturbed.reset(), steps[:3])
@@ -109,8 +109,8 @@ def test_a_partial_reset_does_not_change_other_rows():
 
 
 def test_rows_masked_out_of_a_step_do_not_move():
-    env = NicoEnv(batch_size=[3], observation="both")
-    undisturbed = NicoEnv(batch_size=[3], observation="both")
+    env = NicoEnv(batch_size=[3], observation="both", seed=0)
+    undisturbed = NicoEnv(batch_size=[3], observation="both", seed=0)
     start = env.reset()
     undisturbed.reset()
     first, second = actions(env, 2)
@@ -146,7 +146,7 @@ def succeed(env: NicoEnv, row: int, td: TensorDictBase) -> TensorDictBase:
 
 def loaded(env: NicoEnv) -> NicoEnv:
     """Return a new environment with the state of another."""
-    fresh = NicoEnv(batch_size=env.batch_size, observation=env.observation)
+    fresh = NicoEnv(batch_size=env.batch_size, observation=env.observation, seed=0)
     fresh.load_simulation_state(env.simulation_state())
     return fresh
 
@@ -174,13 +174,13 @@ def test_success_terminates_only_its_row_which_stands_still_until_its_reset(cont
 
 
 def test_episodes_have_no_time_limit_without_a_step_counter():
-    env = NicoEnv(observation="state")
+    env = NicoEnv(observation="state", seed=0)
     rollout = run(env, env.reset(), torch.zeros(60, 4))
     assert not rollout["done"].any()
 
 
 def test_observations_and_saved_states_share_no_memory_with_the_environment():
-    env = NicoEnv(batch_size=[2], observation="both")
+    env = NicoEnv(batch_size=[2], observation="both", seed=0)
     kept, copies = [], []
     td = env.reset()
     state = env.simulation_state()
@@ -204,7 +204,7 @@ def test_observations_and_saved_states_share_no_memory_with_the_environment():
 
 
 def test_bad_tasks_and_actions_are_refused_before_any_row_changes():
-    env = NicoEnv(batch_size=[2], observation="state")
+    env = NicoEnv(batch_size=[2], observation="state", seed=0)
     td = env.reset(task_td(2, 0))
     before = env.simulation_state()
     for method, entries in (
@@ -233,12 +233,13 @@ def test_a_row_without_an_episode_cannot_step():
 
 
 def test_a_state_of_another_environment_is_refused():
-    env = NicoEnv(batch_size=[2], observation="state")
+    env = NicoEnv(batch_size=[2], observation="state", seed=0)
     env.reset(task_td(0, 2))
     for other in (
         {"batch_size": [3], "observation": "state"},
         {"batch_size": [2], "observation": "pixels"},
         {"batch_size": [2], "observation": "state", "tasks": ["grasp_glass"]},
+        {"batch_size": [2], "observation": "state", "tasks": nico.PAPER_TASKS[::-1]},
     ):
         with pytest.raises(ValueError, match="use the same"):
             NicoEnv(**other).load_simulation_state(env.simulation_state())

@@ -49,6 +49,7 @@ def test_the_environment_returns_the_executed_action():
     env = robot_scene().simulate(TASKS, batch_size=[1])
     assert stepped(env, 0.7)["executed_action"].tolist() == [[LIMIT]]
     assert stepped(env, -0.1)["executed_action"].tolist() == [[np.float32(-0.1)]]
+    assert env.reset()["executed_action"].tolist() == [[0.0]]
     free = RobotEnv(SavedDot, TASKS, batch_size=[1], **SHAPE)  # executes what it is told
     assert stepped(free, 0.7)["executed_action"].tolist() == [[np.float32(0.7)]]
 
@@ -68,6 +69,21 @@ def test_executed_actions_are_not_lost_in_an_environment_of_simulations():
         stepped(SimulationEnv(Limited, TASKS, **SHAPE), 0.7)
     with pytest.raises(ValueError, match=r"leave Outcome\.executed out"):
         check_scene(scene(Limited))
+
+
+def test_after_an_emergency_stop_the_episode_is_over():
+    class Stops(SavedDot):
+        def step(self, action):
+            if action > 0.5:
+                raise RuntimeError("stopped by hand")
+            return super().step(action)
+
+    env = robot_scene(Stops).simulate(TASKS)
+    with pytest.raises(RuntimeError, match="stopped by hand"):
+        stepped(env, 0.7)
+    with pytest.raises(ValueError, match="reset the environment first"):
+        env.step(env.rand_action())
+    assert not stepped(env, 0.1)["done"]
 
 
 def test_recordings_hold_the_executed_actions(tmp_path):

@@ -47,7 +47,7 @@ def dot(monkeypatch):
 
 
 def test_an_environment_of_a_simulation_keeps_the_promises_to_torchrl():
-    env = scene().simulate(TASKS, batch_size=[2])
+    env = scene().simulate(TASKS, batch_size=[2], seed=0)
     check_env_specs(env)
     start = env.reset(TensorDict({"task": torch.tensor([0, 1])}, [2]))
     assert start["pixels"].shape == (2, 16, 24, 3)

@@ -87,7 +87,7 @@ def test_to_advance_is_a_step_without_its_observation(load, monkeypatch):
     monkeypatch.setattr(env.task, "get_observation", None)
     env.physics.set_state(start)
     for action, (last, state) in zip(random_actions(10), expected, strict=True):
-        assert env.advance(action) == last
+        assert env.advance(action) == (last, last)
         np.testing.assert_array_equal(env.physics.get_state(), state)
 
 

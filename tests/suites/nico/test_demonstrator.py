@@ -39,6 +39,12 @@ def test_it_needs_a_reset_and_a_task_with_a_demonstration(physics):
     env = nico.load("grasp_glass", seed=0, observation="state", physics=physics)
     with pytest.raises(RuntimeError, match="reset"):
         Demonstrator(env)(env.reset())
+    demonstrator, timestep = Demonstrator(env), env.reset()
+    demonstrator.reset()
+    for _ in range(2):
+        timestep = env.step(demonstrator(timestep))
+    with pytest.raises(RuntimeError, match="reset"):
+        demonstrator(env.reset())
     env._task = type("Juggle", (nico.NicoTask,), {})(random=np.random.RandomState(0))
     with pytest.raises(ValueError, match="Juggle"):
         Demonstrator(env)

@@ -32,6 +32,27 @@ def test_a_simulation_continues_bit_for_bit_from_its_state(load, task):
     assert contacts
 
 
+def test_a_reloaded_scene_is_queried_and_drawn_as_a_new_one():
+    env = nico.load("grasp_glass", seed=0)
+    before = env.reset().observation["pixels"]
+    added = (
+        '<body name="post" pos="0.3 0.3 0.7"><geom name="post" type="sphere" size="0.01"/></body>'
+    )
+    xml = (
+        nico.scene_xml()
+        .replace("<worldbody>", f"<worldbody>{added}")
+        .replace('rgba=".85 .10 .12 1"', 'rgba=".1 .1 .9 1"')
+    )
+    env.physics.reload_from_xml_string(xml)
+    env.task.random.seed(0)
+    after = env.reset().observation["pixels"]
+    fresh = nico.load("grasp_glass", seed=0, physics=Physics.from_xml_string(xml))
+    np.testing.assert_array_equal(after, fresh.reset().observation["pixels"])
+    assert (after != before).any()
+    assert env.physics.gap("glass", "green_box") == fresh.physics.gap("glass", "green_box")
+    assert env.physics.palm_position().tolist() == fresh.physics.palm_position().tolist()
+
+
 def test_a_state_holds_where_objects_stood_at_the_start(load, physics):
     env = load("push_green_to_white", seed=0, observation="state")
     env.reset()
