@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import shutil
@@ -339,10 +340,14 @@ def _write(path: Path, scene: Scene, episodes: Episodes, settings: Mapping[str, 
     with new_folder(path) as folder:
         dataset = make_dataset(folder, meta)
         row = 0
-        for task, some in enumerate(episodes.values()):
+        for task, (name, some) in enumerate(episodes.items()):
             n_shown = len(some) - held_out_per_task
             for number in range(len(some)):
-                fill_row(dataset, row, some[number], task, number < n_shown)
+                episode = some[number]
+                with _naming(name, number):
+                    if _check_episode(scene, episode) != lengths[row]:
+                        raise ValueError("is another one when read again")
+                fill_row(dataset, row, episode, task, number < n_shown)
                 row += 1
         write_json(folder / META, {**meta, "checksum": checksum_of(dataset)})
     return dataset
@@ -378,6 +383,8 @@ def _check_counts(episodes: Episodes, held_out_per_task: int) -> None:
     if held_out_per_task < 0:
         raise ValueError(f"held_out_per_task must be at least 0, got {held_out_per_task}")
     for name, some in episodes.items():
+        if not hasattr(some, "__len__"):
+            raise ValueError(f"{name!r} has a {type(some).__name__}: give a list of its episodes")
         if not len(some):
             raise ValueError(f"there is no episode of {name!r}: add some, or leave the task out")
         if len(some) <= held_out_per_task:
@@ -398,11 +405,9 @@ def _check_episodes(
             raise ValueError(f"{name!r} has one mapping: give a list of episodes, a mapping each")
         for number in range(len(some)):
             episode = some[number]
-            try:
+            with _naming(name, number):
                 _check_keys(episode, keys, logged)
                 lengths.append(_check_episode(scene, episode))
-            except ValueError as error:
-                raise ValueError(f"episode {number} of {name!r} {error}") from None
             keys = set(episode)
             for doubt in _doubts(scene, episode, known):
                 doubtful.setdefault(doubt, []).append(f"{number} of {name!r}")
@@ -410,6 +415,14 @@ def _check_episodes(
         share = f"{len(which)} of {len(lengths)} episodes"
         warnings.warn(f"{share}, such as {which[0]}, {doubt}", stacklevel=4)
     return keys or set(), lengths
+
+
+@contextlib.contextmanager
+def _naming(name: str, number: int) -> Iterator[None]:
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"episode {number} of {name!r} {error}") from None
 
 
 def _doubts(scene: Scene, episode: Mapping[str, Any], known: set[bytes]) -> Iterator[str]:

@@ -18,6 +18,8 @@ from PIL import Image, ImageOps
 from bgpo_trl.errors import UnreadableError, check_fetched
 
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp")
+# Of Pillow and PyAV.
+_UNDECODABLE = (OSError, SyntaxError, ValueError, IndexError, Image.DecompressionBombError)
 
 
 def decode_image(content: bytes) -> NDArray[np.uint8]:
@@ -30,9 +32,10 @@ def decode_image(content: bytes) -> NDArray[np.uint8]:
     image = ImageOps.exif_transpose(Image.open(io.BytesIO(content)))
     sixteen = content.startswith(b"\x89PNG") and content[24] > 8  # Pillow drops half of them
     if sixteen or image.mode not in ("1", "L", "P", "RGB", "LA", "RGBA"):
+        what = "not of red, green and blue" if image.mode == "CMYK" else "of more than 8 bits"
         raise UnreadableError(
-            f"its images are of mode {image.mode}, of more than 8 bits: make them uint8 by a scale "
-            "of yours, or choose another camera"
+            f"its images are of mode {image.mode}, {what}: make them uint8 RGB by a scale of "
+            "yours, or choose another camera"
         )
     if image.has_transparency_data:
         check_opaque(np.asarray(image.convert("RGBA")))
@@ -50,6 +53,20 @@ def check_depth(stream: Any) -> None:
             f"its frames are {stream.format.name}, of more than 8 bits, as of a depth map or of "
             "HDR: convert it to 8 bits"
         )
+
+
+def undamaged(frames: Iterable[Any]) -> Iterator[Any]:
+    """Yield frames of PyAV, all that it decodes, since damage spreads to later ones.
+
+    Decoders of H.264 and MPEG-4 tell which frames are damaged; those of VP9 and HEVC do not.
+
+    Raises:
+        UnreadableError: If a frame is damaged.
+    """
+    for frame in frames:
+        if frame.is_corrupt:
+            raise UnreadableError("it is damaged, and its frames would be guessed: get it again")
+        yield frame
 
 
 def decode_frame(frame: Any) -> NDArray[np.uint8]:
@@ -86,36 +103,28 @@ def read_film(path: Path) -> Iterator[NDArray[np.uint8]]:
 
     Raises:
         UnreadableError: If there is no such film, PyAV is missing, or frames cannot be read, are
-            transparent, of more than 8 bits a color or of several sizes.
+            damaged, transparent, of more than 8 bits a color or of several sizes; if a film ends
+            before its time, or images of a folder are not of one series.
     """
     if not path.exists():
         raise UnreadableError(f"there is no {path}: name a film, or a folder of images")
-    found = False
-    frames = _images_in(path) if path.is_dir() else _decoded(path)
-    for frame in alike(frames, f"the frames in {path}"):
-        found = True
+    shape = None
+    for frame in _images_in(path) if path.is_dir() else _decoded(path):
+        if shape not in (None, frame.shape):
+            sizes = f"{[*shape]} and {[*frame.shape]}"
+            raise UnreadableError(f"the frames in {path} differ in size, {sizes}: make them alike")
+        shape = frame.shape
         yield frame
-    if not found:
+    if shape is None:
         raise UnreadableError(f"{path} has no frames: name a film, or a folder of images")
 
 
-def alike(frames: Iterable[NDArray[np.uint8]], what: str) -> Iterator[NDArray[np.uint8]]:
-    """Yield frames ``[H, W, 3]`` of one size.
-
-    Raises:
-        UnreadableError: If there are several sizes; ``what`` names the frames.
-    """
-    shape = None
-    for frame in frames:
-        if shape not in (None, frame.shape):
-            sizes = f"{[*shape]} and {[*frame.shape]}"
-            raise UnreadableError(f"{what} differ in size, {sizes}: make them alike")
-        shape = frame.shape
-        yield frame
-
-
 def _images_in(folder: Path) -> Iterator[NDArray[np.uint8]]:
-    images = [file for file in folder.iterdir() if file.suffix.lower() in _IMAGES]
+    known = Image.registered_extensions()
+    images = [file for file in folder.iterdir() if file.suffix.lower() in known]
+    other = next((file for file in images if file.suffix.lower() not in _IMAGES), None)
+    if other is not None:
+        raise UnreadableError(f"{other} is no {', '.join(_IMAGES)}: convert it, or take it away")
     order = sorted(images, key=lambda file: _with_numbers(file, r"(\d+)"))
     by_time = sorted(images, key=lambda file: _with_numbers(file, r"(\d+\.\d+|\d+)"))
     if order != by_time:
@@ -123,6 +132,13 @@ def _images_in(folder: Path) -> Iterator[NDArray[np.uint8]]:
         raise UnreadableError(
             f"{other} has a point in its name, by which the order of frames is not clear: number "
             "them, as in 0001.png"
+        )
+    series = {re.sub(r"\d+", "0", file.name.lower()): file for file in order}
+    if len(series) > 1:
+        one, two, *_ = series.values()
+        raise UnreadableError(
+            f"{one} and {two.name} are not of one series: keep the frames of one camera in a "
+            "folder, named alike, as in 0001.png"
         )
     for file in order:
         with _decoding(file):
@@ -132,8 +148,20 @@ def _images_in(folder: Path) -> Iterator[NDArray[np.uint8]]:
 def _decoded(file: Path) -> Iterator[NDArray[np.uint8]]:
     with _decoding(file), importlib.import_module("av").open(str(file)) as film:
         check_depth(film.streams.video[0])
-        for frame in film.decode(video=0):
+        end = None
+        for frame in undamaged(film.decode(video=0)):
+            end = frame.time
             yield decode_frame(frame)
+        rate = film.streams.video[0].average_rate
+        # Of a film with sound, the whole may be longer than what is seen.
+        if end is None or not rate or not film.duration or len(film.streams) > 1:
+            return
+        seconds = ((film.start_time or 0) + film.duration) / 1e6
+        if end + float(3 / rate) < seconds:
+            raise UnreadableError(
+                f"its last frame is at {end:.2f} s of {seconds:.2f} s, so the rest is missing: get "
+                "it again"
+            )
 
 
 @contextlib.contextmanager
@@ -148,7 +176,7 @@ def _decoding(file: Path) -> Iterator[None]:
         raise UnreadableError(
             f"{file} is a film: pip install av (PyAV) to decode it, or name a folder of its frames"
         ) from None
-    except (OSError, SyntaxError, ValueError, IndexError) as error:  # of Pillow and PyAV
+    except _UNDECODABLE as error:
         raise UnreadableError(
             f"{file} cannot be decoded: name a film, or a folder of its frames as PNG"
         ) from error

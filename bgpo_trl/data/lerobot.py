@@ -20,7 +20,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from bgpo_trl.data.dataset import resize_frames
-from bgpo_trl.data.film import alike, check_depth, decode_frame, decode_image
+from bgpo_trl.data.film import check_depth, decode_frame, decode_image, undamaged
 from bgpo_trl.errors import UnreadableError, check_fetched
 
 try:
@@ -170,6 +170,7 @@ class _Reader:
         self.path, self.image_key, self.frame_shape = path, image_key, frame_shape
         self.is_video = self.features[image_key] == "video"
         self._images: tuple[Path | None, Sequence[Any]] = (None, [])
+        self._stored: tuple[int, ...] | None = None  # shape of the frames
         self.doubt = ""
         # Number and end (s) of the last episode of each film, by chunk and file.
         self._last: dict[tuple[int, int], tuple[int, float]] = {}
@@ -353,6 +354,7 @@ class _Reader:
             )
         n_read, first_read = (len(rows) - 1) // stride + 1, (len(rows) - 1) % stride
         frames = self._frames(rows[first_read::stride], times[first_read::stride], place)
+        frames = map(self._of_one_shape, frames)
         if self.frame_shape is not None:
             frames = (resize_frames(frame[None], self.frame_shape)[0] for frame in frames)
         first = next(frames)
@@ -370,6 +372,15 @@ class _Reader:
             episode[key] = values[: (n_read - 1) * stride] if is_action else values[::stride]
         return episode
 
+    def _of_one_shape(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        self._stored = self._stored or frame.shape
+        if frame.shape != self._stored:
+            raise UnreadableError(
+                f"its images differ in size, {[*self._stored]} and {[*frame.shape]}: make them "
+                "alike"
+            )
+        return frame
+
     def _frames(
         self, rows: pd.DataFrame, times: NDArray[np.float64], place: Sequence[Any]
     ) -> Iterator[NDArray[np.uint8]]:
@@ -385,7 +396,7 @@ class _Reader:
                 if seconds > end + 0.5 / self.fps:
                     self._doubt_film(last, end, f"the film at {seconds:.3f} s")
             return
-        yield from alike(self._stored_images(rows), "its images")
+        yield from self._stored_images(rows)
 
     def _stored_images(self, rows: pd.DataFrame) -> Iterator[NDArray[np.uint8]]:
         for file, row in zip(rows["file"], rows["row"], strict=True):
@@ -454,7 +465,7 @@ def _frames_at(
             )
         start = max(0, int((times[0] - tolerance) / stream.time_base))
         video.seek(start, stream=stream)  # to the keyframe before
-        frames = video.decode(stream)
+        frames = undamaged(video.decode(stream))
         frame = next(frames, None)
         following = next(frames, None)
         for time in times:

@@ -96,9 +96,9 @@ def record_demonstrations(
         )
     if not tasks:
         raise ValueError("name at least one of the tasks")
-    if seed < 0 or attempts < 1:
+    if not 0 <= seed < 2**63 or attempts < 1:
         raise ValueError(
-            f"seed must be at least 0 and attempts at least 1, got {seed} and {attempts}"
+            f"seed must lie in 0..2**63 - 1 and attempts be at least 1, got {seed} and {attempts}"
         )
     if not 0 <= held_out_per_task < per_task:
         raise ValueError(

@@ -54,7 +54,11 @@ def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     path = Path(path)
     if os.path.lexists(path):
         raise ValueError(f"{path} exists: choose another folder, or remove it")
-    make_folder(path)
+    make_folder(path.parent)
+    try:
+        path.mkdir()
+    except FileExistsError:  # of another process, by now
+        raise ValueError(f"{path} exists: choose another folder, or remove it") from None
     try:
         yield path
     except BaseException:

@@ -109,6 +109,27 @@ def test_episodes_may_be_tensors_that_are_loaded_on_demand(tmp_path):
     assert (lazy == eager).all()
 
 
+@pytest.mark.parametrize(
+    ("second", "cause"),
+    [
+        (lambda pixels: pixels[:-1], "episode 0 of .* is another one when read again"),
+        (lambda pixels: pixels / 255, "episode 0 of .* has pixels float64"),
+    ],
+)
+def test_an_episode_that_changes_between_two_readings_is_refused(tmp_path, second, cause):
+    class Changing(OnDemand):
+        n_read = 0
+
+        def __getitem__(self, number):
+            self.n_read += 1
+            pixels = episode_of(number + 4)["pixels"]
+            return {"pixels": pixels if self.n_read <= len(self) else second(pixels)}
+
+    with pytest.raises(ValueError, match=cause):
+        write(tmp_path / "own", {TASKS[0]: Changing()})
+    assert not (tmp_path / "own").exists()
+
+
 def test_episodes_without_movement_and_such_as_are_given_twice_are_named(tmp_path):
     moving = episode_of(4, keys=("pixels",))
     still = {"pixels": moving["pixels"][:1].repeat(3, 0)}
@@ -180,6 +201,7 @@ MISSING = {**episodes_of(), TASKS[1]: [episode_of(2), episode_of(7), None, episo
         (changed(state=np.zeros((6, 15))), "has the state", "give [6, 16] numbers"),
         ({}, "there are no episodes", "give some"),
         ({**episodes_of(), "push_green_to_glass": []}, "no episode of", "leave the task out"),
+        ({TASKS[0]: iter([episode_of(4)])}, "has a list_iterator", "give a list"),
         ({"grasp_glass": [episode_of(3)]}, "'grasp_glass' has 1 episodes", "lower held_out"),
         ({"juggle": [episode_of(3)] * 2}, "no task 'juggle'", "add it first"),
     ],

@@ -406,7 +406,7 @@ class StandIn(ModuleType):
     def __init__(self, kept, pix_fmt):
         super().__init__("av")
         self.__spec__ = ModuleSpec("av", None)
-        self.kept = [*kept]
+        self.kept, self.corrupt = [*kept], None
         bits = 8 if pix_fmt == "yuv420p" else 16
         stream = SimpleNamespace(
             format=SimpleNamespace(name=pix_fmt, components=[SimpleNamespace(bits=bits)]),
@@ -426,6 +426,7 @@ class StandIn(ModuleType):
         for number in self.kept:
             shown = np.full((32, 64, 3), GRAYS[number], np.uint8)
             frame = {"time": number / 5, "side_data": {}, "format": SimpleNamespace(components=())}
+            frame["is_corrupt"] = number == self.corrupt
             yield SimpleNamespace(**frame, to_ndarray=lambda format, shown=shown: shown)
 
 
@@ -464,6 +465,26 @@ def test_frames_of_a_video_are_decoded_from_the_first_of_the_episode(written, fi
     path.unlink()
     with pytest.raises(ValueError, match=r"episode 0 of .*file-000.mp4 is missing: give the"):
         read_lerobot(written)
+
+
+def test_episodes_of_other_sizes_are_not_squeezed_into_one(written, refused):
+    sizes = [(8, 8)] * 5 + [(8, 4)] * 6
+    images = [{"bytes": saved(Image.new("RGB", size))} for size in sizes]
+    replaced(CAMERA, images)(written)
+    cause = "differ in size, [8, 8, 3] and [4, 8, 3]"
+    refused(lambda: read_lerobot(written, frame_shape=(8, 8)), cause, "make them alike")
+
+
+def test_a_damaged_video_is_refused(written, film, refused):
+    path = film()
+    if isinstance(stand_in := sys.modules["av"], StandIn):
+        stand_in.corrupt = 2
+    else:
+        content = bytearray(path.read_bytes())
+        data = content.index(b"mdat") + 4
+        content[data + 200 : data + 216] = b"\x55" * 16
+        path.write_bytes(content)
+    refused(lambda: read_lerobot(written), "episode 0 of ", "damaged")
 
 
 @pytest.mark.parametrize(

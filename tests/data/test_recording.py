@@ -169,7 +169,8 @@ def test_the_environment_is_closed_if_a_recording_fails(tmp_path):
     [
         ({"held_out_per_task": 3}, "held_out_per_task is 3: it must be less than per_task, 3"),
         ({"per_task": 0}, "held_out_per_task is 1: it must be less than per_task, 0"),
-        ({"seed": -1}, "seed must be at least 0"),
+        ({"seed": -1}, "seed must lie in 0..2"),
+        ({"seed": 2**63}, "seed must lie in 0..2"),
     ],
 )
 def test_wrong_arguments_are_refused_before_anything_is_written(tmp_path, wrong, message):

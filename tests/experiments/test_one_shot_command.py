@@ -1,6 +1,9 @@
 """`bgpo one-shot`: a film is read exactly or refused; what it prints is what the policy infers."""
 
+import sys
 from collections import Counter
+from contextlib import nullcontext
+from fractions import Fraction
 from types import SimpleNamespace
 
 import numpy as np
@@ -110,6 +113,48 @@ def test_frames_of_films_are_upright_and_opaque():
             decoded(**wrong)
 
 
+@pytest.mark.parametrize(
+    ("changes", "cause"),
+    [
+        ({}, None),
+        ({"start_time": None}, None),
+        ({"n_streams": 2, "duration": 9e5}, None),  # its sound goes on
+        ({"duration": None}, None),
+        ({"duration": 9e5}, "its last frame is at 0.40 s of 0.90 s"),
+        ({"corrupt": 2}, "it is damaged"),
+    ],
+)
+def test_a_film_that_is_damaged_or_cut_off_is_refused(
+    tmp_path, monkeypatch, refused, changes, cause
+):
+    """Here in place of PyAV's."""
+    given = {"start_time": 0, "duration": 5e5, "n_streams": 1, "corrupt": None, **changes}
+    (tmp_path / "a.mkv").touch()
+    camera = SimpleNamespace(format=SimpleNamespace(components=()), average_rate=Fraction(10))
+    streams = type("Streams", (list,), {"video": [camera]})([camera] * given["n_streams"])
+    frames = [
+        SimpleNamespace(
+            time=number / 10,
+            is_corrupt=number == given["corrupt"],
+            side_data={},
+            format=camera.format,
+            to_ndarray=lambda format, number=number: FRAMES[number],
+        )
+        for number in range(5)
+    ]
+    opened = SimpleNamespace(
+        streams=streams,
+        duration=given["duration"],
+        start_time=given["start_time"],
+        decode=lambda video: iter(frames),
+    )
+    monkeypatch.setitem(sys.modules, "av", SimpleNamespace(open=lambda _: nullcontext(opened)))
+    if cause is None:
+        np.testing.assert_array_equal([*read_film(tmp_path / "a.mkv")], FRAMES[:5])
+    else:
+        refused(lambda: [*read_film(tmp_path / "a.mkv")], cause, "get it again")
+
+
 def test_what_cannot_be_read_is_refused_in_one_line(film, tmp_path, refused):
     (tmp_path / "empty").mkdir()
     refused(lambda: [*read_film(tmp_path / "empty")], "has no frames", "name a film")
@@ -119,14 +164,18 @@ def test_what_cannot_be_read_is_refused_in_one_line(film, tmp_path, refused):
     refused(lambda: [*read_film(text)], str(text), "a folder of its frames")
     clear = np.zeros((64, 128, 4), np.uint8)
     for name, pixels, cause, remedy in (
-        ("size", FRAMES[0, :9], "differ in size", "make them alike"),
-        ("clear", clear, "transparent", "put them on a background"),
+        ("9998.png", FRAMES[0, :9], "differ in size", "make them alike"),
+        ("9998.png", clear, "transparent", "put them on a background"),
+        ("9998.webp", FRAMES[0], "9998.webp is no .png", "convert it"),
+        ("9998.jpg", FRAMES[0], "9998.jpg are not of one series", "one camera"),
+        ("0003 (1).png", FRAMES[0], "0003 (1).png", "not of one series"),
+        ("depth_0003.png", FRAMES[0], "depth_0003.png", "not of one series"),
     ):
-        path = film / f"{name}.png"
+        path = film / name
         Image.fromarray(pixels).save(path)
         refused(lambda: [*read_film(film)], cause, remedy)
         path.unlink()
-    (film / "broken.png").write_bytes(b"\x89PNG")
-    refused(lambda: [*read_film(film)], "broken.png cannot be decoded", "as PNG")
-    (film / "broken.png").write_bytes(POINTER)
-    refused(lambda: [*read_film(film)], "broken.png is a pointer of Git LFS", "git lfs pull")
+    (film / "9998.png").write_bytes(b"\x89PNG")
+    refused(lambda: [*read_film(film)], "9998.png cannot be decoded", "as PNG")
+    (film / "9998.png").write_bytes(POINTER)
+    refused(lambda: [*read_film(film)], "9998.png is a pointer of Git LFS", "git lfs pull")
