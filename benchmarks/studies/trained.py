@@ -2,6 +2,7 @@
 
     python benchmarks/studies/trained.py runs/continual-bgpo-quick --episodes 200
     python benchmarks/studies/trained.py ... --latest   # what averaging the weights is worth
+    python benchmarks/studies/trained.py ... --speeds 1.5 2   # a clone that only moves faster
 
 Starts and held-out demonstrations depend on the seed and the number of tests alone, so that runs of
 the same seeds and tasks, such as ``bgpo`` and ``clone``, are tested from the same starts.
@@ -9,7 +10,7 @@ the same seeds and tasks, such as ``bgpo`` and ``clone``, are tested from the sa
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from shared import TrainedArguments, load_blocks, write_measurement
 from torch import Tensor
 
+from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.analysis.statistics import mean
 from bgpo_trl.analysis.tables import markdown
@@ -68,6 +70,8 @@ class WeightsArguments(TrainedArguments):
 
     latest: bool = False
     """Test the latest weights, instead of their averages, with which all tests act."""
+    speeds: tuple[float, ...] = ()
+    """Test the clone also with its actions times these: what speed is worth without reward."""
 
 
 class Row(NamedTuple):
@@ -82,8 +86,23 @@ class Row(NamedTuple):
     """Mean length of the successful tests; None without one."""
 
 
+@dataclass(frozen=True)
+class FasterPolicy(Policy):
+    """A policy whose actions are multiplied by ``speed``."""
+
+    speed: float = 1.0
+
+    def act(self, state: Tensor) -> Tensor:
+        """Return actions ``[*B, A]`` in [-1, 1] for states ``[*B, features]``."""
+        return (self.speed * super().act(state)).clamp(-1.0, 1.0)
+
+
 def measure_trained(
-    run: LoadedRun, episodes: int, watch: Callable[[], object] = lambda: None
+    run: LoadedRun,
+    episodes: int,
+    watch: Callable[[], object] = lambda: None,
+    *,
+    speeds: Sequence[float] = (),
 ) -> list[Row]:
     """Test the policies of all seeds of a run, without noise.
 
@@ -93,14 +112,19 @@ def measure_trained(
         run: The run.
         episodes: Test episodes of each task and seed.
         watch: Called at each step of the policies.
+        speeds: Factors of the clone's actions with which it is tested, too.
     """
     config, rows = run.config, list[Row]()
     held_out = run.bank.held_out(config.held_out)
     evaluator = Evaluator(config, held_out, run.encoders, episodes=episodes)
     snapshots = evaluator.snapshots(run.algorithm, _NUMBER)
     chooses = all("only_clone" in snapshot.policy.parameters for snapshot in snapshots)
-    for name, change in POLICIES.items() if chooses else [*POLICIES.items()][:1]:
-        tested = [_changed(snapshot, change) for snapshot in snapshots]
+    policies = POLICIES if chooses else dict([*POLICIES.items()][:1])
+    imitates = "clone alone" if chooses else "as in tests"
+    variants = [(name, name, 1.0) for name in policies]
+    variants += [(f"{imitates} x {speed:g}", imitates, speed) for speed in speeds]
+    for name, policy, speed in variants:
+        tested = [_changed(snapshot, policies[policy], speed) for snapshot in snapshots]
         result = evaluator.run(tested, run.algorithm.device, watch)
         for i, seed in enumerate(config.seeds):
             for j, task in enumerate(config.tasks):
@@ -112,9 +136,9 @@ def measure_trained(
     return rows
 
 
-def _changed(snapshot: Snapshot, change: Callable[[Weights], Weights]) -> Snapshot:
-    policy = snapshot.policy
-    return replace(snapshot, policy=replace(policy, parameters=change(policy.parameters)))
+def _changed(snapshot: Snapshot, change: Callable[[Weights], Weights], speed: float) -> Snapshot:
+    given = {**vars(snapshot.policy), "parameters": change(snapshot.policy.parameters)}
+    return replace(snapshot, policy=FasterPolicy(**given, speed=speed))
 
 
 def trained(arguments: WeightsArguments) -> str:
@@ -136,9 +160,9 @@ def trained(arguments: WeightsArguments) -> str:
     for run in runs:
         if arguments.latest and isinstance(run.algorithm, BGPO):
             run.algorithm.learner.average.clear()
-        steps = len(POLICIES) * (run.config.algorithm.max_steps + 1)
+        steps = (len(POLICIES) + len(arguments.speeds)) * (run.config.algorithm.max_steps + 1)
         with progress_bar("trained", total=steps, unit="step") as bar:
-            rows += measure_trained(run, arguments.episodes, bar.update)
+            rows += measure_trained(run, arguments.episodes, bar.update, speeds=arguments.speeds)
     table = pd.DataFrame(rows)
     write_measurement(out, "trained-latest" if arguments.latest else "trained", table, commit)
     return summarized(table)

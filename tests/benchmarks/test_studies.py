@@ -4,15 +4,17 @@ import pandas as pd
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch.func import functional_call
 
 from benchmarks.studies import one_task, trained
 from benchmarks.studies.cut_demonstrations import Networks, unknown_task
 from benchmarks.studies.gwr_as_published import Arguments, grow
-from benchmarks.studies.trained import POLICIES, Row, summarized
+from benchmarks.studies.trained import POLICIES, FasterPolicy, Row, measure_trained, summarized
 from bgpo_trl.modules.actor_critic import Actor, Critic, ProposalPolicy
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.policy import load_all_seeds
 from tests.helpers import finish
 
 
@@ -92,6 +94,24 @@ def test_a_policy_of_proposals_is_taken_apart():
     assert as_tested.equal(found["clone alone"])
 
 
+@pytest.mark.usefixtures("easy_world")
+def test_a_faster_clone_multiplies_the_clones_actions(begin, tmp_path):
+    begin(tmp_path / "run").run()
+    run = load_all_seeds(tmp_path / "run")
+    rows = measure_trained(run, 3, speeds=(1.0, -50.0))
+    found = {name: [r[1:] for r in rows if r.policy == name] for name in {r.policy for r in rows}}
+    assert [*dict.fromkeys(r.policy for r in rows)] == [
+        *POLICIES,
+        "clone alone x 1",
+        "clone alone x -50",
+    ]
+    assert found["clone alone x 1"] == found["clone alone"]
+    assert found["clone alone x -50"] != found["clone alone"]
+    fixed = TensorDictModule(lambda state: torch.tensor([0.5, -0.25]), ["state"], ["action"])
+    policy = FasterPolicy(fixed, "state", {}, speed=3.0)
+    assert policy.act(torch.zeros(3)).tolist() == [1.0, -0.75]
+
+
 def test_what_a_policy_has_above_its_clone_is_paired_by_seed():
     """By hand: differences of .2 and .1, so .15 +- .64 with one degree of freedom."""
     success = {"as in tests": (0.9, 0.5), "clone alone": (0.7, 0.4)}
@@ -112,7 +132,8 @@ def test_the_latest_weights_are_tested_if_asked_for(begin, tmp_path, monkeypatch
     begin(tmp_path / "run").run()
     found, expected = [], []
 
-    def measure(run, episodes, watch):
+    def measure(run, episodes, watch, *, speeds):
+        assert speeds == ()
         learner = run.algorithm.learner
         place = torch.zeros((), dtype=torch.int64)
         for averaged, weights in ((False, expected), (True, found)):
