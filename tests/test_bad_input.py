@@ -21,7 +21,7 @@ from bgpo_trl.encoders.pretrained import bank_path, default_weights, load_pretra
 from bgpo_trl.encoders.representation import load_representation
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.files.csv_file import CsvFile
-from bgpo_trl.modules.actor_critic import Actor, Critic
+from bgpo_trl.modules.actor_critic import Actor, Critic, ProposalPolicy
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
@@ -114,6 +114,14 @@ WRONG = {
     "lae short latents": (lambda: lae.encode(z[..., :9], lengths), "[2, 5, 9]"),
     "lae lengths as floats": (lambda: lae.encode(z, lengths.float()), "float32"),
     "lae empty sequence": (lambda: lae.encode(z, 0 * lengths), "in 1..5"),
+    "lae other memory": (
+        lambda: lae.step(z[:, 0], torch.zeros(2, 32), torch.zeros(1, 64)), "[2, 32] and [1, 64]"),
+    "lae other phi": (lambda: lae.decode(torch.zeros(2, 16), 3), "got [2, 16] and 3"),
+    "lae no step": (lambda: lae.decode(torch.zeros(2, 32), 0), "got [2, 32] and 0"),
+    "one critic for two proposals": (
+        lambda: ProposalPolicy(actor(), actor(), critic(1)), "2 critics, got [1]"),
+    "critics of other policies": (
+        lambda: ProposalPolicy(actor(batch_size=[3]), actor(batch_size=[3]), critic(5)), "got [5]"),
     "lae other state": (lambda: lae.step(z[:, 0], z[:, 0, :16], z[:, 0, :16]), "[2, 16]"),
     "actor without its state": (
         lambda: actor()(row({"z": torch.zeros(6)})), "Actor found no 'state'"),
@@ -132,6 +140,9 @@ WRONG = {
     "ddpg without reward": (lambda: loss()(transitions(("next", "reward"))), "('next', 'reward')"),
     "ddpg without termination": (
         lambda: loss()(transitions(("next", "terminated"))), "lacks ('next'"),
+    "ddpg integer termination": (
+        lambda: loss()(transitions().apply(lambda x: x.long() if x.dtype is torch.bool else x)),
+        "'terminated') must be bool, got torch.int64"),
     "ddpg without next state": (
         lambda: loss()(transitions(("next", "state"))), "under 'next', found no 'state'"),
     "ddpg flat reward": (lambda: loss()(transitions(reward=(8,))), "got [8]"),

@@ -130,7 +130,7 @@ class GroupReplay:
         won = entries[self._success_key].flatten().tolist()
         done = entries["next", "done"].flatten().tolist()
         for seed in seeds:
-            if won[seed]:
+            if won[seed] and done[seed]:
                 oldest = max(0, self._n_added[seed] - self.capacity)
                 steps = np.arange(max(self._began[seed], oldest), self._n_added[seed])
                 # A transition's own group: it may have been assigned anew since.
@@ -342,8 +342,16 @@ class GroupReplay:
                 f"the saved replay has capacity {capacity} and {len(n_added)} seeds, this one "
                 f"{self.capacity} and {len(self._n_added)}: build it with the saved sizes"
             )
-        self._rows = {}
-        for key, saved in TensorDict(state_dict["rows"]).items(True, True):
+        rows = TensorDict(state_dict["rows"])
+        further = (self._source_key, self._success_key)
+        wanted = {*self._keys, *(key for key in further if key is not None)}
+        if (there := {*rows.keys(True, True)} - {_GROUP}) and there != wanted:
+            raise ValueError(
+                f"the saved replay has {sorted(map(str, there))}, this one stores "
+                f"{sorted(map(str, wanted))}: build it with the saved keys"
+            )
+        self._rows = {_GROUP: self._allocate(torch.Size(), torch.int64)}
+        for key, saved in rows.items(True, True):
             self._rows[key] = self._allocate(saved.shape[1:], saved.dtype)
             self._rows[key][: len(saved)] = saved
         self._n_added = n_added.tolist()
@@ -366,6 +374,7 @@ class GroupReplay:
         """Index what the buffer holds of a seed."""
         rows, oldest = self._held(seed), self._oldest()[seed]
         self._index[seed], self._won[seed] = _GroupIndex(), _GroupIndex()
+        self._began[seed] = 0
         if not len(rows):
             return
         groups = self._rows[_GROUP][rows].numpy()
@@ -376,7 +385,7 @@ class GroupReplay:
                 for key in (("next", "done"), self._success_key)
             )
             episode = np.cumsum(done) - done
-            in_success = np.isin(episode, episode[won])
+            in_success = np.isin(episode, episode[won & done])
             self._won[seed].extend(np.where(in_success, groups, -1), oldest)
             self._began[seed] = int(oldest + np.flatnonzero(done).max(initial=-1) + 1)
 

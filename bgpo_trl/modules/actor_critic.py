@@ -145,6 +145,9 @@ class ProposalPolicy(TensorDictModuleBase):
         critic: Q-functions of ``batch_size`` ``[*S, N]``, at least two of them.
         caution: See above; 0 compares the means.
 
+    Raises:
+        ValueError: If there are not at least two critics of each policy.
+
     Attributes:
         only_clone: Where the policy takes the action of the clone whatever the critics say, bool
             ``[*S]``.
@@ -163,6 +166,12 @@ class ProposalPolicy(TensorDictModuleBase):
 
     def __init__(self, actor: Actor, clone: Actor, critic: Critic, caution: float = 1.0) -> None:
         super().__init__()
+        *batch, n_critics = (*critic.batch_size,) or (1,)
+        if (*batch,) != (*actor.batch_size,) or n_critics < 2:
+            raise ValueError(
+                f"critic must have the batch_size {[*actor.batch_size]} and at least 2 critics, "
+                f"got {[*critic.batch_size]}"
+            )
         self.caution = caution
         self.in_keys, self.out_keys = actor.in_keys, ["action"]
         self.actor, self.clone, self.critic = actor, clone, critic

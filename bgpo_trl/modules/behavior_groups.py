@@ -255,8 +255,8 @@ class BehaviorGroups:
             The match ``[]`` from before learning.
 
         Raises:
-            ValueError: As from `lookup`, or if starts differ in size or are not finite; nothing has
-                changed then.
+            ValueError: As from `lookup`, or if starts differ in size, are not finite or no vector;
+                nothing has changed then.
         """
         phi = as_tensor(phi, "phi")
         if phi.ndim != 1:
@@ -264,8 +264,8 @@ class BehaviorGroups:
         first = np.empty(0, np.float32)
         if start is not None:
             first = as_tensor(start, "start").cpu().numpy().astype(np.float32)
-        if not np.isfinite(first).all():
-            raise ValueError(f"start must be finite numbers, got {first.tolist()}")
+        if first.ndim != 1 or not np.isfinite(first).all():
+            raise ValueError(f"start must be [f] finite numbers, got {first.tolist()}")
         if len(self.points) and first.shape != self.starts.shape[1:]:
             raise ValueError(
                 f"the starts of earlier demonstrations have {self.starts.shape[1]} features, this "

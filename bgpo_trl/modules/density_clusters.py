@@ -48,6 +48,9 @@ def density_clusters(
         outliers, which no branch had absorbed when it became a cluster of its own. All 0 if there
         is one cluster.
 
+    Raises:
+        ValueError: If two points are equal.
+
     Examples:
         >>> points = np.random.default_rng(0).normal(size=(60, 4))
         >>> np.bincount(density_clusters(points))
@@ -63,6 +66,8 @@ def density_clusters(
     if n_points < 2 * smallest:
         return labels
     square = squareform(pdist(points))
+    if (square == 0).sum() > n_points:
+        raise ValueError("two points are equal, or too near to tell apart: give each once")
     near = np.sort(np.partition(square, smallest)[:, : smallest + 1])[:, 1:]
     core = near[:, k - 1]
     reach = np.maximum(square, np.maximum(core, core[:, None]), out=square)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor, nn
@@ -85,7 +86,10 @@ class MultiHeadActor(StackedNetwork):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the distributions of actions; return the same tensordict."""
-        hidden = self.trunk(self.input(tensordict)).relu()
+        hidden = self.trunk(self.input(tensordict))
+        if self.trunk.layer_norm:
+            hidden = F.layer_norm(hidden, hidden.shape[-1:])
+        hidden = hidden.relu()
         task_dim = len(self.batch_size)
         if hidden.shape[task_dim] != len(self.heads):
             raise ValueError(

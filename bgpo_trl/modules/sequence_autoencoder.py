@@ -74,10 +74,11 @@ class SequenceAutoencoder(nn.Module):
         is phi.
         """
         shape = h.shape
-        if z.shape != (*shape[:-1], self.latent_size) or shape[-1] != self.embedding_size:
+        of_z = (*shape[:-1], self.latent_size)
+        if z.shape != of_z or c.shape != shape or shape[-1] != self.embedding_size:
             raise ValueError(
-                f"z must be [..., {self.latent_size}] and h [..., {self.embedding_size}], of the "
-                f"same batch, got {[*z.shape]} and {[*shape]}"
+                f"z must be [..., {self.latent_size}], h and c [..., {self.embedding_size}], of "
+                f"the same batch, got {[*z.shape]}, {[*shape]} and {[*c.shape]}"
             )
         state = (h.reshape(-1, self.embedding_size), c.reshape(-1, self.embedding_size))
         z = z.reshape(-1, self.latent_size)
@@ -86,6 +87,11 @@ class SequenceAutoencoder(nn.Module):
 
     def decode(self, phi: Tensor, n_steps: int) -> Tensor:
         """Reconstruct ``[..., n_steps, latent_size]`` from each phi, the last latent first."""
+        if phi.shape[-1] != self.embedding_size or n_steps < 1:
+            raise ValueError(
+                f"phi must be [..., {self.embedding_size}] and n_steps at least 1, got "
+                f"{[*phi.shape]} and {n_steps}"
+            )
         inputs = phi.reshape(-1, 1, self.embedding_size).expand(-1, n_steps, -1)
         hidden, _ = self.decoder(inputs)
         return self.readout(hidden).reshape(*phi.shape[:-1], n_steps, self.latent_size)

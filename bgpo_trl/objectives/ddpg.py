@@ -42,7 +42,8 @@ class TransitionKeys:
     priority: NestedKey = "td_error"
     """Squared error of the critics, written for prioritized replay."""
     priority_weight: NestedKey = "priority_weight"
-    """Factor of each transition's loss."""
+    """Factor of each transition's loss; the mean is over all transitions, whatever their weights
+    (TorchRL's losses divide by the sum of the weights)."""
     imitation: NestedKey = "imitation"
     """Nested entry: demonstrated states and actions to imitate."""
 
@@ -99,7 +100,8 @@ class DDPGLoss(LossModule):
         clone_network: Policy that imitates, with the inputs of the actor; ``None`` for none.
         n_critics: Number ``N`` of Q-functions.
         imitation: Weight of the actor's squared distance to demonstrated actions, at first.
-        imitation_half_life: Updates of an actor in which this weight halves; ``None`` for never.
+        imitation_half_life: Calls of `loss_actor`, one in each update of an actor, in which this
+            weight halves; ``None`` for never.
         return_bounds: Lowest and highest attainable return; ``None`` for no clipping. With a reward
             of 0 or 1 that ends the episode and an intrinsic reward of at most ``beta`` at its end,
             returns lie in ``[0, 1 + beta]``; if time-outs pay the intrinsic reward and bootstrap,
@@ -418,6 +420,9 @@ class DDPGLoss(LossModule):
                 f"the batch lacks ('next', {names.terminated!r}): store it, since only it "
                 "distinguishes a success from a time-out"
             )
+        if (dtype := successor.get(names.terminated).dtype) != torch.bool:
+            # Of integers, the estimator would take the bitwise complement.
+            raise ValueError(f"('next', {names.terminated!r}) must be bool, got {dtype}")
         moving = [key for key in self.input_keys if key not in self.constant_keys]
         data = self._select(successor, moving, ", under 'next',")
         for key in self.constant_keys:

@@ -87,11 +87,14 @@ def vae_inverse_loss(
     known = windows.get("action_known", None)
     if known is None:
         known = torch.ones(pixels.shape[:-4], dtype=torch.bool, device=pixels.device)
-    squared = (predicted - action[..., :-1, :]).square().sum(-1).mean(-1)
+    if known.shape != pixels.shape[:-4]:
+        raise ValueError(f"action_known must be {[*pixels.shape[:-4]]}, got {[*known.shape]}")
+    error_of_action = torch.where(known[..., None, None], predicted - action[..., :-1, :], 0.0)
+    squared = error_of_action.square().sum(-1).mean(-1)
     difference = (frames - vae.mean_frame).abs().amax(-1, keepdim=True)
     counted = error * (1 + config.foreground_weight * difference)
     kl = (mu.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean() / 2
-    inverse = (squared * known).sum() / known.sum().clamp_min(1) / 2
+    inverse = squared.sum() / known.sum().clamp_min(1) / 2
     terms = {
         "loss_reconstruction": config.reconstruction_weight * counted.sum((-3, -2, -1)).mean(),
         "loss_kl": config.kl_weight * kl,

@@ -138,7 +138,10 @@ def test_a_transition_of_several_steps_is_a_plain_walk(capacity, n_steps, played
 @given(
     capacity=st.integers(1, 12),
     played=st.lists(
-        st.tuples(st.integers(0, 2), st.sampled_from(["goes on", "fails", "succeeds"])),
+        st.tuples(
+            st.integers(0, 2),
+            st.sampled_from(["goes on", "goes on, succeeding", "fails", "succeeds"]),
+        ),
         min_size=1,
         max_size=40,
     ),
@@ -164,13 +167,14 @@ def test_successes_are_the_steps_of_episodes_that_ended_with_one(
         if step == restored:
             state, replay = through_a_file(replay.state_dict()), empty()
             replay.load_state_dict(state)
-        won, done = torch.tensor([[outcome == "succeeds"]]), torch.tensor([[outcome != "goes on"]])
+        won = torch.tensor([[outcome in ("succeeds", "goes on, succeeding")]])
+        done = torch.tensor([["goes on" not in outcome]])
         moment = {"latent": torch.tensor([[step]]), "source": torch.tensor([group])}
         after = {"done": done, "success": won}
         replay.add(TensorDict({**moment, "next": after}, [1]), torch.tensor([group]))
         episode.append((group, step))
         if done:
-            kept += episode * bool(won)
+            kept += episode * bool(won)  # of the last step
             episode = []
     if regrouped:
         replay.regroup(0, torch.tensor([2, 0, 0]))
@@ -239,6 +243,39 @@ def test_rows_of_a_group_grow_beyond_a_thousand_and_are_forgotten():
     for group, (first, end) in enumerate(((550, 1100), (1100, 1850))):
         drawn = replay.sample(torch.full((1, 500), group))["latent"]
         assert first <= drawn.min() and drawn.max() < end
+
+
+def of_successes(keys=("latent",), success_key=("next", "success")):
+    return GroupReplay(
+        9, generator=generators(1), keys=[*keys, ("next", "done")], success_key=success_key
+    )
+
+
+def play(replay, n_steps, group=0):
+    """Store an episode that succeeds."""
+    for step in range(n_steps):
+        ends = torch.tensor([[step == n_steps - 1]])
+        moment = {"latent": torch.tensor([[step]]), "next": {"done": ends, "success": ends}}
+        replay.add(TensorDict(moment, [1]), torch.tensor([group]))
+
+
+def test_an_empty_replay_restored_over_another_knows_its_next_success():
+    replay = of_successes()
+    play(replay, 6)
+    replay.load_state_dict(of_successes().state_dict())
+    play(replay, 4)
+    drawn = replay.draw(torch.zeros(1, 60, dtype=torch.int64), successes=True)
+    assert {*drawn["latent"].flatten().tolist()} == {0, 1, 2, 3}
+    assert drawn["priority_weight"].all()
+
+
+@pytest.mark.parametrize("other", [{"keys": ("latent", "joints")}, {"success_key": None}])
+def test_a_replay_of_other_entries_is_refused_and_changes_nothing(other):
+    saved, replay = of_successes(), of_successes(**other)
+    play(saved, 3)
+    with pytest.raises(ValueError, match="build it with the saved keys"):
+        replay.load_state_dict(saved.state_dict())
+    assert len(replay) == 0
 
 
 def test_a_seed_is_restored_though_another_has_stored_nothing_yet():

@@ -54,8 +54,8 @@ def test_a_network_can_be_called_with_the_weights_of_any_stack(network, stack):
 # ---- the policy with a head for each task
 
 
-def multi_head(n_heads, hidden_sizes=(64,)):
-    actor = MultiHeadActor(5, 2, in_keys=["state"], hidden_sizes=hidden_sizes)
+def multi_head(n_heads, hidden_sizes=(64,), **options):
+    actor = MultiHeadActor(5, 2, in_keys=["state"], hidden_sizes=hidden_sizes, **options)
     for _ in range(n_heads):
         actor.add_head()
     return actor
@@ -75,6 +75,18 @@ def test_a_head_maps_the_output_of_the_trunk_to_mean_and_deviation(hidden_sizes)
         # Log-scales are spread evenly between those of the narrowest and of the widest.
         torch.testing.assert_close(data["scale"][task].log10(), scale.sigmoid() - 1)
     assert data["action"].equal(data["loc"])
+
+
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_a_head_with_the_trunk_is_an_actor(layer_norm):
+    actor = multi_head(2, (16, 12), layer_norm=layer_norm)
+    state = torch.randn(2, 7, 5)
+    action = actor(TensorDict({"state": state}, [2, 7]))["action"]
+    one = Actor(5, 2, in_keys=["state"], hidden_sizes=(16, 12), layer_norm=layer_norm)
+    for task in range(2):
+        one.load_state_dict(actor.policy(task))
+        expected = one(TensorDict({"state": state[task]}, [7]))["action"]
+        torch.testing.assert_close(action[task], expected)
 
 
 def test_a_new_head_changes_neither_the_others_nor_the_trunk():

@@ -129,8 +129,13 @@ def test_bad_inputs_are_rejected_and_change_nothing(phi):
             call(phi)
     with pytest.raises(ValueError, match="phi must"):
         groups.adapt(torch.zeros(2, 4))
-    with pytest.raises(ValueError, match=r"start must be finite numbers, got \[0.0, nan\]"):
-        groups.adapt(torch.zeros(4), torch.tensor([0.0, torch.nan]))
+    for start, shown in (
+        ([0, torch.nan], r"\[0.0, nan\]"),
+        (1.0, "1.0"),
+        ([[1.0]], r"\[\[1.0\]\]"),
+    ):
+        with pytest.raises(ValueError, match=f"start must be .* finite numbers, got {shown}"):
+            groups.adapt(torch.zeros(4), torch.tensor(start))
     assert len(groups.points) == 0
     for options in ({"smallest": 3}, {"smallest": 4.5}, {"evidence": 0}):
         with pytest.raises(ValueError, match="smallest must be"):

@@ -16,6 +16,14 @@ from bgpo_trl.modules.density_clusters import (
 CENTERS = 9 * np.eye(6)
 
 
+def test_a_repeated_point_is_refused():
+    """Its distance of 0 would make the dimension 0, and all clusters one."""
+    points, _ = blobs([20, 40])
+    for repeated in (np.concatenate([points, points[:1]]), 1e-165 * points):
+        with pytest.raises(ValueError, match="two points are equal, or too near"):
+            density_clusters(repeated)
+
+
 def blobs(sizes, d=6, seed=0):
     """Gaussian blobs of unit variance, nine times their deviation from the origin."""
     rng = np.random.default_rng(seed)

@@ -100,6 +100,11 @@ def test_only_known_actions_train_the_inverse_model() -> None:
     expected = data["action"][[0, 2], :2].square().sum(-1).mean() / 2
     loss = vae_inverse_loss(vae, data, VAEConfig())  # type: ignore[arg-type]
     assert loss["inverse"] == pytest.approx(expected.item())
+    data["action"][1] = torch.nan  # whatever stands for an unknown action
+    assert vae_inverse_loss(vae, data, VAEConfig())["inverse"] == loss["inverse"]  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"action_known must be \[3\], got \[3, 1\]"):
+        wrong = data.clone().set("action_known", known.unsqueeze(-1))
+        vae_inverse_loss(vae, wrong, VAEConfig())  # type: ignore[arg-type]
     data["action_known"][:] = False
     assert vae_inverse_loss(vae, data, VAEConfig())["inverse"] == 0  # type: ignore[arg-type]
 
