@@ -297,8 +297,8 @@ class BehaviorGroups:
         """Restore a `state_dict`.
 
         Raises:
-            ValueError: If it is damaged, or of another number of features; nothing has changed
-                then.
+            ValueError: If entries are missing or do not fit each other, or the number of features
+                is another one; nothing has changed then.
         """
         lacking = {*_ARRAYS, *_LISTS, "latest", "revision", "trials"} - state.keys()
         if lacking:
@@ -312,6 +312,10 @@ class BehaviorGroups:
         sizes = {len(arrays[name]) for name in _ARRAYS if name != "cluster"}
         if len(sizes) > 1 or not {*arrays["group"].tolist()} <= {*range(len(state["parent"]))}:
             raise ValueError("a group is missing in the state: load one that state_dict returned")
+        n_points = len(arrays["points"])
+        shown = len(arrays["cluster"]) <= n_points and state["latest"] < max(1, n_points)
+        if not shown or not np.isfinite(arrays["points"]).all():
+            raise ValueError("the state has other points than were shown: load one as returned")
         vars(self).update(arrays)
         for name in _LISTS:
             setattr(self, name, [*state[name]])

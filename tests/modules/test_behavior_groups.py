@@ -161,6 +161,9 @@ def test_damaged_states_and_those_of_other_sizes_are_rejected_and_change_nothing
         BehaviorGroups(3).state_dict(),
         {**before, "group": before["group"] + 1},
         {**before, "member": before["member"][1:]},
+        {**before, "points": before["points"] * torch.nan},
+        {**before, "cluster": before["cluster"].repeat(2)},
+        {**before, "latest": 12},
         {},
     ):
         with pytest.raises(ValueError, match="state"):
