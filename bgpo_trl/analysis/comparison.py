@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -99,11 +99,13 @@ class Setting:
         kind = "concurrent" if self.from_start else "continual" if self.in_sequence else "staggered"
         return "-".join([kind, str(len(self.first.tasks)), *self._more]).replace(" ", "-")
 
-    def find(self, algorithm: str, changed: Mapping[str, Any] | None = None) -> Run | None:
-        """Return the first run of an algorithm with so changed hyperparameters, by default none."""
-        wanted = (algorithm, changed or {})
-        found = (run for run in self.runs.values() if (run.algorithm, run.changed) == wanted)
-        return next(found, None)
+    def find(self, like: Run) -> Run | None:
+        """Return the first run of the same algorithm with the same hyperparameters as another."""
+
+        def settings(run: Run) -> tuple[str, Any, Any]:
+            return run.algorithm, run.changed, run.config.get("algorithm")
+
+        return next((run for run in self.runs.values() if settings(run) == settings(like)), None)
 
 
 def read_settings(directories: Sequence[Path]) -> tuple[list[Setting], str]:
@@ -153,8 +155,8 @@ def _setting(runs: list[Run]) -> Setting:
         runs,
         key=lambda run: (order.get(run.algorithm, len(order)), bool(run.changed), run.directory),
     )
-    for run in runs[1:]:
-        check_conditions(runs[0], run)
+    for one, other in combinations(runs, 2):
+        check_conditions(one, other)
     alike: dict[str, list[Run]] = {}
     for run in runs:
         alike.setdefault(title_of(run), []).append(run)

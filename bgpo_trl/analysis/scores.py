@@ -70,7 +70,7 @@ def late_scores(run: Run) -> Values:
     if len(lacking):
         raise ValueError(
             f"{run.directory} has no late test of seed {run.seeds[lacking[0]]}, or not of each "
-            "task: let the run finish"
+            "task: let the run finish, or test more often"
         )
     return scores
 
@@ -233,9 +233,11 @@ def forward_transfer(run: Run, reference: Run) -> Estimate | None:
     Continual World (Wolczyk et al., 2021): 1 for success from the start, 0 for no gain, negative
     for slower learning. The interval is Welch's of the seeds' contributions to first order (the
     delta method), so that the seeds of the reference count, too. None if the reference leaves
-    nothing to gain on a task.
+    nothing to gain on a task, or a task has no test in its phase.
     """
     ours, theirs = own_areas(run, reference)
+    if np.isnan(ours).any():
+        return None
     area, height = ours.mean(0), theirs.mean(0)
     left = 1 - height
     if (left < 1e-9).any():  # a mean of equal areas may differ from 1 in its last digit
@@ -252,14 +254,17 @@ def own_areas(run: Run, reference: Run) -> tuple[Values, Values]:
     The mean height of a task's curve from the first to the last test of its own phase. As an
     episode is of any of the presented tasks, curves are over the expected number of the task's own
     episodes, and the reference's is read off at the tests of the run: learners with the same curve
-    have the same area. The first task is left out, since nothing precedes it. Tasks of the
-    reference may have another order.
+    have the same area. NaN for a task without a test in its phase. The first task is left out,
+    since nothing precedes it. Tasks of the reference may have another order.
     """
     begun, areas = run.starts, []
     for task, end in enumerate([*begun[2:], run.last], 1):
-        own, curves = _own_curves(run, task)
+        own, curves = _own_curves(run, task, end)
         of_reference, others = _own_curves(reference, reference.tasks.index(run.tasks[task]))
-        last = min(float(expected_own_episodes(run, task, end)), of_reference[-1])
+        if not len(own):
+            areas.append([np.full(len(one.seeds), np.nan) for one in (run, reference)])
+            continue
+        last = min(own[-1], of_reference[-1])
         first = min(max(own[0], of_reference[0]), last)
         tests = np.array([first, *own[(own > first) & (own < last)], last])
         areas.append((_mean_height(tests, own, curves), _mean_height(tests, of_reference, others)))
@@ -267,10 +272,15 @@ def own_areas(run: Run, reference: Run) -> tuple[Values, Values]:
     return np.stack(ours, axis=-1), np.stack(theirs, axis=-1)
 
 
-def _own_curves(run: Run, task: int) -> tuple[Values, Values]:
-    """Return a task's expected own episodes at its tests, ``[E]``, and the curves, ``[S, E]``."""
+def _own_curves(run: Run, task: int, end: int | None = None) -> tuple[Values, Values]:
+    """Return a task's expected own episodes at its tests, ``[E]``, and the curves, ``[S, E]``.
+
+    Tests after episode ``end`` are left out.
+    """
     own = expected_own_episodes(run, task, run.episodes)
     played = np.diff(own, prepend=0.0) > 0
+    if end is not None:
+        played &= run.episodes <= end
     return own[played], run.success[:, played, task]
 
 

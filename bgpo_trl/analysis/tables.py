@@ -145,14 +145,14 @@ def sequence_section(setting: Setting, reference: Setting | None) -> Section:
     """Return forgetting and transfer in a setting with tasks one after the other."""
     rows = [["", "forgetting", "forward transfer"]]
     for name, run in setting.runs.items():
-        beside = reference.find(run.algorithm, run.changed) if reference is not None else None
+        beside = reference.find(run) if reference is not None else None
         forward = None if beside is None else forward_transfer(run, beside)
         forgotten = statistics.mean(forgetting(success_matrix(run)).mean(1)).points()
         rows.append([name, forgotten, forward.points() if forward else "-"])
     notes = (
         "Means over seeds and 95 % intervals, in points. Forgetting: mean over tasks of R[j, j] "
         "minus R at the end. R[i, j] is the success on task j at the end of the phase of "
-        "task i, over as many tests as the last fifth of the shortest phase has.",
+        "task i, over as many episodes as the last fifth of the shortest phase has.",
         "Forward transfer: (area - reference) / (1 - reference), areas under a task's curve over "
         "its own episodes, from the first to the last test of its phase; reference: the same "
         "algorithm with all tasks from the start, whose seeds count in the interval.",

@@ -251,6 +251,9 @@ class Run:
             return "is being extended"
         if episodes - self.last >= self.eval_every:
             return f"has tests until episode {self.last} of {episodes}"
+        # Its hyperparameters are not told yet, and its last tests may be written in part.
+        if not self.summary and (self.directory / "checkpoint").exists():
+            return "has no summary"
         return ""
 
 
@@ -339,6 +342,7 @@ def _joined(parts: list[Run]) -> Run:
     """Return runs of different seeds as one."""
     if len(parts) == 1:
         return parts[0]
+    parts = sorted(parts, key=lambda run: run.seeds)
     first, summary = parts[0], dict(parts[0].summary)
     for key in _OF_SEEDS:
         values = [run.summary.get(key) for run in parts]

@@ -52,9 +52,12 @@ def test_changed_hyperparameters_are_part_of_a_name(tmp_path):
         ("BGPO", plain),
         ("BGPO, beta 0.2, rl.name td3", changed),
     ]
-    assert setting.find("bgpo") is setting.runs["BGPO"]
+    found = setting.runs["BGPO"]
+    assert setting.find(found) is found
     (alone,) = settings_in(changed)[0].values()
-    assert alone.find("bgpo") is None
+    assert alone.find(found) is None
+    other = write_run(tmp_path, "bgpo", 8, directory="c", algorithm={"max_steps": 50, "beta": 0.9})
+    assert setting.find(read_run(other)) is None  # whether or not its summary tells
 
 
 @pytest.mark.parametrize(
@@ -70,6 +73,14 @@ def test_runs_under_other_conditions_are_refused(tmp_path, refused, what, ours, 
     other = write_run(tmp_path, "oracle", 5, starts=SEQUENCE, **more)
     edit(other / "config.json", **{what: theirs})
     refused(lambda: settings_in(tmp_path), f"differ in {what} ({ours} and {theirs})", "only runs")
+
+
+def test_all_runs_are_compared_with_each_other(tmp_path, refused):
+    """Also those after a run that does not state the condition."""
+    write_run(tmp_path, "bgpo", 5)
+    write_run(tmp_path, "oracle", 5, spread=1.0)
+    write_run(tmp_path, "maml", 5, spread=0.25)
+    refused(lambda: settings_in(tmp_path), "differ in spread (", "only runs")
 
 
 def test_seeds_and_algorithms_are_not_conditions(tmp_path):
@@ -121,6 +132,23 @@ def test_unfinished_runs_are_left_out(tmp_path):
     assert read_run(path).unfinished == "is being extended"
     with pytest.raises(ValueError, match="is being extended: let them finish"):
         read_settings([path])
+    (path / "checkpoint").mkdir()
+    (path / "summary.json").unlink()  # interrupted in its last tests
+    assert read_run(path).unfinished == "has no summary"
+
+
+def test_jobs_of_one_run_are_joined_in_the_order_of_their_seeds(tmp_path):
+    for level, seed in enumerate((1, 10, 2)):
+        path = write_run(tmp_path, "bgpo", [level], directory=f"seed-{seed}")
+        edit(path / "config.json", seeds=[seed])
+        rows = (path / "eval.csv").read_text().replace("bgpo,0,", f"bgpo,{seed},")
+        (path / "eval.csv").write_text(rows)
+        edit(path / "summary.json", groups=[level])
+    (setting,) = settings_in(tmp_path)[0].values()
+    (run,) = setting.runs.values()
+    assert run.seeds == (1, 2, 10)
+    assert run.summary["groups"] == [0, 2, 1]
+    assert run.success[:, -1].mean(-1).tolist() == pytest.approx([0, 0.2, 0.1])
 
 
 def test_folders_without_runs_are_refused(tmp_path):

@@ -139,6 +139,16 @@ def test_forward_transfer_compares_areas_over_the_own_episodes_of_a_phase():
     assert forward_transfer(make_run(), make_run(np.ones((6, 3)), (0, 0, 0))) is None
 
 
+def test_what_follows_a_phase_is_no_part_of_its_area():
+    """Phases end between tests, and nothing is remembered."""
+    success = [[1, NAN, NAN], [1, NAN, NAN], [0, 1, NAN], [0, 1, NAN], [0, 0, 1], [0, 0, 1]]
+    run = make_run(success, (0, 12, 22), schedule="sequential")
+    ours, theirs = own_areas(run, make_run(np.ones((6, 3)), (0, 0, 0), schedule="sequential"))
+    assert ours.tolist() == theirs.tolist() == [[1, 1]] * 2
+    short = make_run(success, (0, 11, 14), schedule="sequential")
+    assert forward_transfer(short, make_run(RISING, (0, 0, 0), schedule="sequential")) is None
+
+
 @pytest.mark.parametrize("curve", [lambda own: 0 * own + 0.8, lambda own: np.minimum(own / 9, 1)])
 def test_forward_transfer_is_zero_for_order_independent_learning(curve):
     episodes = 5 * np.arange(1, 25)
