@@ -358,6 +358,7 @@ class Algorithm(ABC):
             self.bank,
             generator=generators(self.seeds, "demonstration replay"),
             noise=self.config.demonstration_noise,
+            pace=self.config.demonstration_pace,
             joints=self._demonstrated_joints(),
             limit=self.config.state_limit,
             constant_keys=constant_keys,

@@ -179,6 +179,10 @@ class AlgorithmConfig(Settings):
     """Standard deviation of the noise added to the demonstrated states that a policy imitates; None
     for the one that was chosen when the bank was made (`choose_noise`). Ours: keeps policies from
     learning a few demonstrations by heart (docs/learning.md)."""
+    demonstration_pace: float = 1.0
+    """Factor of the demonstrated actions that a policy imitates. Ours: with 1.5, it learns the same
+    movement in two thirds of the steps, where an action is a displacement or a speed, as NICO's;
+    where it is a place, leave 1."""
 
     @property
     def observed(self) -> str:
@@ -201,6 +205,7 @@ class AlgorithmConfig(Settings):
             positive(self, "state_limit")
         if self.demonstration_noise is not None:
             at_least(self, 0, "demonstration_noise")
+        positive(self, "demonstration_pace")
         if share and rl.warmup_steps < self.max_steps:
             # Else, seeds would learn from demonstrations sooner or later than each would alone.
             raise ValueError(

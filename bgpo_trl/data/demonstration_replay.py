@@ -27,6 +27,7 @@ class DemonstrationReplay:
         bank: Demonstrations that episodes are drawn from, with their steps.
         generator: Random generators for sampling, one for each of ``S`` seeds.
         noise: Standard deviation of Gaussian noise on states to imitate, by default the bank's.
+        pace: Factor of actions to imitate, which stay in [-1, 1].
         limit: Largest size of a latent's numbers, as policies read them; None for none.
         joints: Joints in each frame of the bank's steps, as policies read them, float32
             ``[F, J]``, by which ``"latent_and_joints"`` stands in place of ``"latent"``; or None.
@@ -46,6 +47,7 @@ class DemonstrationReplay:
         *,
         generator: Sequence[torch.Generator],
         noise: float | None = None,
+        pace: float = 1.0,
         limit: float | None = None,
         joints: Tensor | None = None,
         constant_keys: Sequence[NestedKey] = (),
@@ -70,6 +72,7 @@ class DemonstrationReplay:
         self._key = "latent" if joints is None else "latent_and_joints"
         self._generators = list(generator)
         self.noise = bank.noise if noise is None else noise
+        self._pace = pace
         self._n_steps, self._gamma = n_steps, gamma
         self._limit = math.inf if limit is None else limit
         self._own_constants = own_constants
@@ -134,6 +137,7 @@ class DemonstrationReplay:
         """Draw latents, with noise, and actions to imitate: as `draw`, without ``"next"``."""
         sources = self._generators if generator is None else generator
         entries, _, frame, _ = self._draw_frames(group, sources)
+        entries["action"] = (self._pace * entries["action"]).clamp(-1.0, 1.0)
         return {**entries, self._key: self.blur(self._states(frame), group, sources)}
 
     def blur(

@@ -125,6 +125,15 @@ def test_what_is_to_be_imitated_are_the_same_draws_with_noise_on_the_states_alon
     assert not spread["priority_weight"][:, 1::2].any()
 
 
+def test_a_pace_changes_what_is_imitated_and_not_what_was_done(make_shown):
+    plain, fast = make_shown(noise=0.0), make_shown(noise=0.0, pace=1.5)
+    group = torch.zeros(2, 500, dtype=torch.int64)
+    action = plain.draw_actions(group)["action"]
+    assert fast.draw_actions(group)["action"].equal((1.5 * action).clamp(-1, 1))
+    assert (1.5 * action).abs().max() > 1  # so that some stay at the ends
+    assert fast.draw(group)["action"].equal(plain.draw(group)["action"])
+
+
 def test_constants_are_of_any_demonstration_of_the_group_if_not_its_own(bank):
     replay = make(bank.seen(), own_constants=False)
     show(replay, [(3, 1.0, 0), (5, 1.0, 0)], [(4, 1.0, 0), (6, 1.0, 0)], [(7, 1.0, 1), (8, 1.0, 1)])
