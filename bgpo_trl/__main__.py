@@ -8,9 +8,11 @@ from __future__ import annotations
 import importlib
 import inspect
 import sys
+from typing import Any
 
 from bgpo_trl.experiments import arguments
 from bgpo_trl.experiments.command_line import command_line
+from bgpo_trl.interrupts import interrupts_wait
 
 COMMANDS: dict[str, dict[str, tuple[str, type]]] = {
     "make data": {
@@ -54,10 +56,14 @@ def main() -> None:
         sys.stderr.write(f"bgpo: there is no command {name!r}\n{_listed()}")
         sys.exit(2)
     module, kind = commands[name]
+
+    def command(given: Any) -> str | None:
+        with interrupts_wait():  # libraries that are interrupted while they load may abort
+            loaded = importlib.import_module(f"bgpo_trl.{module}")
+        return getattr(loaded, name.replace("-", "_"))(given)
+
     command_line(
-        lambda given: getattr(
-            importlib.import_module(f"bgpo_trl.{module}"), name.replace("-", "_")
-        )(given),
+        command,
         options,
         kind=kind,
         program=f"bgpo {name}",

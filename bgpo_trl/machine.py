@@ -4,23 +4,16 @@ from __future__ import annotations
 
 import ctypes
 import os
-import signal
 import sys
-import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 
 T = TypeVar("T")
-_USUAL = {  # handlers, of SIGTERM also that of command lines, which resume after it
-    signal.SIGINT: (signal.default_int_handler,),
-    signal.SIGTERM: (signal.SIG_DFL, signal.default_int_handler),
-}
 # Options of mallopt (malloc.h), and bytes.
 _KEEP_FREED = {
     -1: 2**30,  # M_TRIM_THRESHOLD: free memory that is kept
@@ -166,37 +159,3 @@ class RowPool:
     def close(self) -> None:
         """End the helpers."""
         self._pool.shutdown()
-
-
-@contextmanager
-def interrupts_wait() -> Iterator[Callable[[], bool]]:
-    """Defer the first Ctrl-C or SIGTERM to the end of the block; a second one interrupts at once.
-
-    SIGTERM is what ``kill`` and cluster schedulers send before they end a process. Both raise
-    ``KeyboardInterrupt``. Yields a function that returns whether a signal came. Signal handling is
-    left unchanged outside the main thread, and of a signal that is ignored (Ctrl-C of background
-    jobs) or has a custom handler.
-    """
-    asked = False
-
-    def ask(signum: int, frame: Any) -> None:
-        nonlocal asked
-        if asked:
-            raise KeyboardInterrupt
-        asked = True
-
-    in_main = threading.current_thread() is threading.main_thread()
-    usual = {
-        number: signal.getsignal(number)
-        for number, handlers in _USUAL.items()
-        if in_main and signal.getsignal(number) in handlers
-    }
-    for number in usual:
-        signal.signal(number, ask)
-    try:
-        yield lambda: asked
-    finally:
-        for number, handler in usual.items():
-            signal.signal(number, handler)
-    if asked:
-        raise KeyboardInterrupt

@@ -26,8 +26,8 @@ from bgpo_trl.evaluation import Evaluator
 from bgpo_trl.files.checkpoint import save_checkpoint
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.writing import lock_directory
+from bgpo_trl.interrupts import interrupts_wait
 from bgpo_trl.logged import LoggedEpisodes, replay_logged
-from bgpo_trl.machine import interrupts_wait
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.cost import CostLog
 from bgpo_trl.runs.dashboard import Dashboard

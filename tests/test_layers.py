@@ -24,7 +24,7 @@ LAYERS = (
 """In the order of docs/design.md; ``top`` is the package itself."""
 TOP = ("world", "logged", "evaluation", "training", "policy")
 """Modules and packages of ``top``, in their order."""
-OPEN = ("configs", "errors", "seeding", "machine")
+OPEN = ("configs", "errors", "interrupts", "seeding", "machine")
 """Open to all; they import from none of the layers."""
 LAST = ("__init__", "__main__")
 """The package's face and its command line, which import from anywhere."""

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -17,7 +18,7 @@ from bgpo_trl import __main__ as bgpo
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.experiments.arguments import Arguments, ProbesArguments, RecordArguments
 from bgpo_trl.experiments.command_line import command_line
-from bgpo_trl.machine import interrupts_wait
+from bgpo_trl.interrupts import interrupts_wait
 from suites import opengl
 from tests.helpers import contents
 
@@ -165,6 +166,23 @@ def test_an_interrupted_run_exits_with_the_status_for_another_try(capsys, number
     assert "--resume" in capsys.readouterr().err
     assert saved == [1] * training
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_a_signal_waits_until_a_commands_libraries_are_loaded(monkeypatch, capsys):
+    loaded = []
+
+    def load(name):
+        signal.raise_signal(signal.SIGTERM)
+        loaded.append(name)  # not reached by what would interrupt it
+        return SimpleNamespace(continual=loaded.append)
+
+    monkeypatch.setattr(bgpo.importlib, "import_module", load)
+    monkeypatch.setattr(sys, "argv", ["bgpo", "continual"])
+    with pytest.raises(SystemExit) as ended:
+        bgpo.main()
+    assert ended.value.code == os.EX_TEMPFAIL
+    assert loaded == ["bgpo_trl.experiments.run"]
+    assert "--resume" in capsys.readouterr().err
 
 
 def test_warnings_of_the_package_are_one_line_and_those_of_others_as_usual():
