@@ -61,6 +61,9 @@ def test_nothing_that_was_learned_changes_when_a_task_is_added(grow, three):
     with resumed(run, grown) as trainer:
         trainer.save()
     before, after = load_checkpoint(three / "checkpoint"), load_checkpoint(run / "checkpoint")
+    *known, new = after["world"]["simulation"].pop("tasks")
+    assert (*known,) == before["world"]["simulation"].pop("tasks")
+    assert new == NEW
     for part in ("algorithm", "world", "state", "env_steps", "losses"):
         assert_same(before[part], after[part])
     config, _ = read_config(run / "config.json")

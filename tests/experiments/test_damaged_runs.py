@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import warnings
 from functools import partial
 
@@ -94,8 +95,12 @@ def test_final_tests_and_summary_are_optional_in_a_report(run):
     assert "nan" not in text
     assert "| one for all |  | 25.00 | 25 25 | 3 4 |" in text
     assert "- `c`, `python`" in text
-    for name in ("final.csv", "summary.json"):
-        (run / name).unlink()
+    (run / "final.csv").unlink()
+    report(ReportArguments((run,)))
+    (run / "summary.json").unlink()
+    with pytest.raises(ValueError, match="has no summary: let them finish"):
+        report(ReportArguments((run,)))  # it can be resumed, and has a summary then
+    shutil.rmtree(run / "checkpoint")
     text = report(ReportArguments((run,)))
     assert "## GWR-B" not in text and "## Cost" in text
 
