@@ -289,10 +289,8 @@ class NicoTask(control.Task):
         """Return new arrays: ``pixels`` uint8 ``[H, W, 3]``, ``privileged_state`` ``[16]``."""
         observation: OrderedDict[str, np.ndarray] = OrderedDict()
         if self._observation != "state":
-            model = physics.model.ptr
-            if self._renderer is None or not (
-                self._shares_renderer or self._renderer.model is model
-            ):
+            model, own = physics.model.ptr, not self._shares_renderer
+            if self._renderer is None or (own and self._renderer.model is not model):
                 self.close()
                 height, width = self._frame_size
                 self._renderer = FrameRenderer(model, height=height, width=width)

@@ -39,8 +39,9 @@ class Physics(dm_mujoco.Physics):
     # Indices are cached, since a lookup by `named` takes much longer than the read itself.
 
     def _reload_from_data(self, data: Any) -> None:
-        for name in ("_arm", "_curls", "_ids", "_hand", "actuated_limits"):
-            vars(self).pop(name, None)
+        for name, member in vars(Physics).items():
+            if isinstance(member, cached_property):
+                vars(self).pop(name, None)
         super()._reload_from_data(data)
 
     @cached_property
