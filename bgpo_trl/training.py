@@ -33,6 +33,7 @@ from bgpo_trl.runs.cost import CostLog
 from bgpo_trl.runs.dashboard import Dashboard
 from bgpo_trl.runs.demonstrations import keep_inputs
 from bgpo_trl.runs.directory import digest_of_logged, fitting_checkpoint, load_last, open_tables
+from bgpo_trl.runs.provenance import command, commit_of_code
 from bgpo_trl.scenes import find_scene
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import TaskSchedule
@@ -142,6 +143,8 @@ class Trainer:
         self._tested = ""
         # Rows of seeds that finished early, kept for a resumed run with more episodes.
         self._later: list[dict[str, Any]] = []
+        # Code and command lines that have trained what the checkpoint holds, and this one.
+        self.starts = [{"commit": commit_of_code(), "command": command()}]
         self._settings = settings_of(config, Digests(used, bank.identity, learned))
         self._state: TensorDictBase | None = None
         self._losses: dict[str, torch.Tensor] = {}
@@ -433,6 +436,7 @@ class Trainer:
             "env_steps": self.env_steps,
             "losses": self._losses,
             "later": self._later,
+            "starts": self.starts,
             "settings": self._settings,
             "position": {name: table.position() for name, table in self.tables.items()},
         }
@@ -447,6 +451,7 @@ class Trainer:
             self.evaluator.load_state_dict(state["evaluator"], self.algorithm)
         self._state = TensorDict(state["state"], self.world.env.batch_size)
         self.env_steps, self._losses = state["env_steps"], state["losses"]
+        self.starts = [*state["starts"], *(x for x in self.starts if x not in state["starts"])]
 
 
 def _executed(transition: TensorDictBase) -> TensorDictBase:

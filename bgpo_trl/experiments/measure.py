@@ -28,7 +28,7 @@ from bgpo_trl.figures.gwr import plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import plot_step_curves, plot_success_curves
 from bgpo_trl.files.progress import progress_bar
-from bgpo_trl.runs.provenance import command, write_table
+from bgpo_trl.runs.provenance import each_once, write_table
 from bgpo_trl.runs.results import COLUMNS, Run, read_run
 from bgpo_trl.scenes import find_scene
 from bgpo_trl.training import Trainer
@@ -57,7 +57,8 @@ def measure(
         scene=config.scene,
     )
     summary = {
-        "command": command(),
+        "commit": each_once(start["commit"] for start in trainer.starts),
+        "command": each_once(start["command"] for start in trainer.starts),
         "episodes": config.episodes,
         "learned_episodes": trainer.world.source.episode.tolist(),
         "random_success": dict(zip(config.tasks, random_success.tolist(), strict=True)),

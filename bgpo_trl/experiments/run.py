@@ -63,7 +63,7 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
         BlockingIOError: If another process is using the directory.
     """
     _check(arguments, config)
-    commit = commit_of_code()  # read first, since commits may follow during training
+    commit_of_code()  # of this moment, before encoders are made
     set_threads(arguments.threads)
     keep_freed_memory()
     device = choose_device(arguments.device)
@@ -113,9 +113,8 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
             loggers=loggers,
         ) as trainer:
             trainer.run()
-            code = {"commit": commit, "versions": versions()}
             changed = changed_hyperparameters(config)
-            summary = {**code, "changed": changed, **measure(trainer, bank, out)}
+            summary = {"versions": versions(), "changed": changed, **measure(trainer, bank, out)}
             lines = draw(trainer, bank, out, summary)
             # Written last, as the mark of a complete run.
             write_json(out / "summary.json", summary)

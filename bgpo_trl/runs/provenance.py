@@ -6,6 +6,8 @@ import importlib.metadata
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 
 import pandas as pd
@@ -13,8 +15,12 @@ import pandas as pd
 from bgpo_trl.files.writing import without_folders, write_whole
 
 
+@cache
 def commit_of_code() -> str:
-    """Return the commit of this code, with ``-dirty`` if it was modified; ``""`` if unknown."""
+    """Return the commit of this code, with ``-dirty`` if it was modified; ``""`` if unknown.
+
+    The first call decides, since commits may follow while a process trains.
+    """
     root = Path(__file__).parents[2]
     if not (root / ".git").exists():  # An installed package may lie in another repository.
         return ""
@@ -40,3 +46,8 @@ def command() -> str:
 def write_table(path: Path, table: pd.DataFrame) -> None:
     """Write a CSV file; NaN becomes an empty cell."""
     write_whole(path, table.to_csv(index=False, lineterminator="\r\n"))
+
+
+def each_once(texts: Iterable[str]) -> str:
+    """Return each text once, in order, joined by ``"; "``, without empty ones."""
+    return "; ".join(filter(None, dict.fromkeys(texts)))

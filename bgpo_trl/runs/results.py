@@ -22,6 +22,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from bgpo_trl.files.writing import make_folder, write_whole
+from bgpo_trl.runs.provenance import each_once
 
 _EPISODE = ("algorithm", "seed", "episode", "env_steps", "task", "success", "return", "steps")
 _OF_TRAINING = ("intrinsic_return", "num_nodes", "group", "num_groups", "loss_actor", "loss_value")
@@ -348,8 +349,7 @@ def _joined(parts: list[Run]) -> Run:
         values = [run.summary.get(key) for run in parts]
         summary[key] = None if None in values else [v for of_run in values for v in of_run or ()]
     for key in ("commit", "command"):
-        stated = dict.fromkeys(run.summary.get(key) or "" for run in parts)
-        summary[key] = "; ".join(filter(None, stated))
+        summary[key] = each_once(run.summary.get(key) or "" for run in parts)
     tables: dict[str, Any] = {}
     for name in ("tests", "training", "final", "costs"):
         of_runs = [getattr(run, name) for run in parts]

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from bgpo_trl import training
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis.comparison import NAMES
 from bgpo_trl.configs import RepresentationConfig
@@ -130,9 +131,15 @@ def test_a_finished_run_is_only_changed_by_making_it_longer(
     refused(from_start, "task_starts is [0, 2, 4] there", "choose another")
 
     (run / "final.csv").unlink()  # as if it had been interrupted in its last tests
+    monkeypatch.setattr(sys, "argv", ["again"])
+    monkeypatch.setattr(training, "commit_of_code", lambda: "c0ffee")
+    began = json_of(run, "summary")["commit"]
     continual(again)
     assert (run / "final.csv").exists()
     assert (run / "train.csv").read_text() == played
+    summary = json_of(run, "summary")
+    assert summary["commit"] == "; ".join(filter(None, [began, "c0ffee"]))
+    assert summary["command"].endswith("; python again")
 
     continual(replace(again, episodes=9, encoders=own_weights(run)))
     config = json_of(run, "config")
