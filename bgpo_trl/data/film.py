@@ -6,7 +6,7 @@ import contextlib
 import importlib
 import io
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -140,9 +140,28 @@ def _images_in(folder: Path) -> Iterator[NDArray[np.uint8]]:
             f"{one} and {two.name} are not of one series: keep the frames of one camera in a "
             "folder, named alike, as in 0001.png"
         )
+    _check_gaps(order)
     for file in order:
         with _decoding(file):
             yield decode_image(file.read_bytes())
+
+
+def _check_gaps(order: Sequence[Path]) -> None:
+    """Raise `UnreadableError` if some of the files that a series of numbers implies are missing."""
+    numbers = [[int(part) for part in re.findall(r"\d+", file.stem)] for file in order]
+    changing = [column for column in zip(*numbers, strict=True) if len({*column}) > 1]
+    if len(changing) != 1:
+        return
+    steps = np.diff(np.array(changing[0], object))
+    usual = min(steps)
+    # Times of frames, as in 1700000033.png, have no common step.
+    if usual and not any(steps % usual) and (steps == usual).mean() > 0.5:
+        for before, after, step in zip(order, order[1:], steps, strict=False):
+            if step > usual:
+                raise UnreadableError(
+                    f"a frame between {before} and {after.name} is missing: get it, or number "
+                    "the frames anew"
+                )
 
 
 def _decoded(file: Path) -> Iterator[NDArray[np.uint8]]:

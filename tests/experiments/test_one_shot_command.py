@@ -80,6 +80,25 @@ def test_frames_are_read_exactly_in_the_order_of_names(film):
         next(read_film(film))
 
 
+@pytest.mark.parametrize(
+    ("numbers", "missing"),
+    [
+        ("3 4 5 7 8", "5.png and 7.png"),
+        ("0 5 10 20 25", "10.png and 20.png"),  # every fifth frame
+        ("1000 1033 1066 1100 1133", None),  # times
+        ("0 10 40 50 70", None),  # too few are alike to tell
+    ],
+)
+def test_a_frame_that_is_missing_is_told_by_its_number(tmp_path, numbers, missing):
+    for number, frame in zip(numbers.split(), FRAMES, strict=False):
+        Image.fromarray(frame).save(tmp_path / f"{number}.png")
+    if missing is None:
+        assert len([*read_film(tmp_path)]) == 5
+    else:
+        with pytest.raises(UnreadableError, match=rf"between .*{missing} is missing: get it, or"):
+            next(read_film(tmp_path))
+
+
 def test_images_are_upright_as_their_camera_says(tmp_path):
     image, exif = Image.fromarray(FRAMES[0]), Image.Exif()
     exif[0x0112] = 6  # to be turned by a quarter, clockwise
@@ -164,10 +183,10 @@ def test_what_cannot_be_read_is_refused_in_one_line(film, tmp_path, refused):
     refused(lambda: [*read_film(text)], str(text), "a folder of its frames")
     clear = np.zeros((64, 128, 4), np.uint8)
     for name, pixels, cause, remedy in (
-        ("9998.png", FRAMES[0, :9], "differ in size", "make them alike"),
-        ("9998.png", clear, "transparent", "put them on a background"),
-        ("9998.webp", FRAMES[0], "9998.webp is no .png", "convert it"),
-        ("9998.jpg", FRAMES[0], "9998.jpg are not of one series", "one camera"),
+        ("0011.png", FRAMES[0, :9], "differ in size", "make them alike"),
+        ("0011.png", clear, "transparent", "put them on a background"),
+        ("0011.webp", FRAMES[0], "0011.webp is no .png", "convert it"),
+        ("0011.jpg", FRAMES[0], "0011.jpg are not of one series", "one camera"),
         ("0003 (1).png", FRAMES[0], "0003 (1).png", "not of one series"),
         ("depth_0003.png", FRAMES[0], "depth_0003.png", "not of one series"),
     ):
@@ -175,7 +194,7 @@ def test_what_cannot_be_read_is_refused_in_one_line(film, tmp_path, refused):
         Image.fromarray(pixels).save(path)
         refused(lambda: [*read_film(film)], cause, remedy)
         path.unlink()
-    (film / "9998.png").write_bytes(b"\x89PNG")
-    refused(lambda: [*read_film(film)], "9998.png cannot be decoded", "as PNG")
-    (film / "9998.png").write_bytes(POINTER)
-    refused(lambda: [*read_film(film)], "9998.png is a pointer of Git LFS", "git lfs pull")
+    (film / "0011.png").write_bytes(b"\x89PNG")
+    refused(lambda: [*read_film(film)], "0011.png cannot be decoded", "as PNG")
+    (film / "0011.png").write_bytes(POINTER)
+    refused(lambda: [*read_film(film)], "0011.png is a pointer of Git LFS", "git lfs pull")
