@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from typing import Any
 
@@ -19,8 +20,6 @@ from torchrl.objectives.value import TD0Estimator
 
 from bgpo_trl.configs import RLConfig
 from bgpo_trl.errors import missing_key
-
-__all__ = ["DDPGLoss", "ForeachSoftUpdate", "TransitionKeys"]
 
 
 @dataclass
@@ -330,7 +329,8 @@ class DDPGLoss(LossModule):
         data = self.call_network("actor_network", self.current(tensordict))
         loss = self.mean_per_seed(self.actor_objective(data), tensordict)
         if self.imitation:
-            loss = loss + self.imitation_weight * self.distance("actor_network", tensordict)
+            actor = partial(self.call_network, "actor_network")
+            loss = loss + self.imitation_weight * self.distance(actor, tensordict)
             self.n_imitated += self.trains(tensordict)
         loss = self.reduce_seeds(loss)
         pre_tanh = data.get(self.tensor_keys.pre_tanh_action, None)
@@ -359,16 +359,25 @@ class DDPGLoss(LossModule):
 
     def loss_clone(self, tensordict: TensorDictBase) -> Tensor:
         """Compute the clone's squared distance to demonstrated actions, reduced."""
-        return self.reduce_seeds(self.distance("clone_network", tensordict))
+        clone = partial(self.call_network, "clone_network")
+        return self.reduce_seeds(self.distance(clone, tensordict))
 
-    def distance(self, name: str, tensordict: TensorDictBase) -> Tensor:
+    def distance(
+        self, policy: Callable[[TensorDictBase], TensorDictBase], tensordict: TensorDictBase
+    ) -> Tensor:
         """Return the mean squared distance ``[*S]`` of a policy to demonstrated actions.
 
-        ``name`` is as for `call_network`.
+        Raises:
+            ValueError: If an entry is missing.
         """
-        states, shown = self.shown(tensordict)
-        acted = self.call_network(name, states)
-        return self.mean_per_seed(self.squared_distance(acted, shown), shown)
+        keys = self.tensor_keys
+        shown = tensordict.get(keys.imitation, None)
+        if not isinstance(shown, TensorDictBase) or keys.action not in shown:
+            wanted = [(keys.imitation, keys.action)]
+            raise missing_key(type(self).__name__, tensordict, wanted)
+        states = self._select(shown, self.actor_network.in_keys, ", under 'imitation',")
+        apart = policy(states).get(keys.action) - shown.get(keys.action)
+        return self.mean_per_seed(apart.square().sum(-1), shown)
 
     @property
     def imitation_weight(self) -> Tensor:
@@ -382,24 +391,6 @@ class DDPGLoss(LossModule):
         if weights is None:
             return torch.ones_like(self.n_imitated, dtype=torch.bool)
         return (self.flatten_batch(weights) > 0).any(-1)
-
-    def shown(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        """Return the policies' input in demonstrated states, and all that is shown, ``[*S, *B]``.
-
-        Raises:
-            ValueError: If an entry is missing.
-        """
-        keys = self.tensor_keys
-        shown = tensordict.get(keys.imitation, None)
-        if not isinstance(shown, TensorDictBase) or keys.action not in shown:
-            wanted = [(keys.imitation, keys.action)]
-            raise missing_key(type(self).__name__, tensordict, wanted)
-        return self._select(shown, self.actor_network.in_keys, ", under 'imitation',"), shown
-
-    def squared_distance(self, acted: TensorDictBase, shown: TensorDictBase) -> Tensor:
-        """Return the squared distance ``[*S, *B]`` of actions to those shown."""
-        key = self.tensor_keys.action
-        return (acted.get(key) - shown.get(key)).square().sum(-1)
 
     def current(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the networks' input, detached, in the states of transitions ``[*S, *B]``."""
@@ -537,26 +528,18 @@ class ForeachSoftUpdate(SoftUpdate):
         if not 0 < tau <= 1:
             raise ValueError(f"tau must be above 0 and at most 1, got {tau}")
         super().__init__(loss_module, tau=tau)
-        pairs = [
-            pair
-            for name, target in loss_module.named_children()
-            if name.startswith("target_") and isinstance(target, TensorDictBase)
-            for pair in _float_pairs(target, getattr(loss_module, name.removeprefix("target_")))
-        ]
-        self._target_tensors, self._source_tensors = map(list, zip(*pairs, strict=True))
+        self._target_tensors, self._source_tensors = list[Tensor](), list[Tensor]()
+        for name, targets in loss_module.named_children():
+            if name.startswith("target_") and isinstance(targets, TensorDictBase):
+                sources = getattr(loss_module, name.removeprefix("target_"))
+                for key, target in targets.items(True, True):
+                    # Those that share their memory have nothing to follow.
+                    if target.is_floating_point() and not target.is_set_to(sources[key].data):
+                        self._target_tensors.append(target)
+                        self._source_tensors.append(sources[key])
         self._decay = 1 - tau
 
     def step(self) -> None:
         """Update all targets: ``target <- (1 - tau) * target + tau * source``."""
         move = get_ema_multi_avg_fn(self._decay)  # a closure, which could not be pickled
         move(self._target_tensors, self._source_tensors, None)
-
-
-def _float_pairs(
-    targets: TensorDictBase, sources: TensorDictBase
-) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield each floating-point target with its source, unless they share their memory."""
-    for key, target in targets.items(True, True):
-        source = sources[key]
-        if target.is_floating_point() and not target.is_set_to(source.data):
-            yield target, source

@@ -97,7 +97,9 @@ class MAMLLoss(DDPGLoss):
         support, query = tensordict.chunk(2, dim=-1)
         adapted = self.adapt(support)
         loss = self.policy_loss(adapted, query)
-        self._keep(adapted)
+        kept = self.actor_network_params.flatten_keys(".")
+        for key, value in adapted.items():
+            kept[key].copy_(value.detach())
         self.n_imitated += self.trains(query)
         return self.reduce_seeds(loss), {}
 
@@ -112,15 +114,15 @@ class MAMLLoss(DDPGLoss):
 
     def policy_loss(self, parameters: Parameters, tensordict: TensorDictBase) -> Tensor:
         """Return ``L_i`` ``[*S, T]`` of policies with parameters ``[*S, T, ...]``, one per task."""
-        data = self.current(tensordict)
-        functional_call(self.actor_network, parameters, (data,))
+
+        def policy(states: TensorDictBase) -> TensorDictBase:
+            return functional_call(self.actor_network, parameters, (states,))
+
+        data = policy(self.current(tensordict))
         loss = self.mean_per_seed(self.actor_objective(data), tensordict)
         if not self.imitation:
             return loss
-        states, shown = self.shown(tensordict)
-        acted = functional_call(self.actor_network, parameters, (states,))
-        distance = self.squared_distance(acted, shown)
-        return loss + self.imitation_weight * self.mean_per_seed(distance, shown)
+        return loss + self.imitation_weight * self.distance(policy, tensordict)
 
     def each_task(self) -> Parameters:
         """Return the policy's parameters before adaptation, as often as tasks, ``[*S, T, ...]``."""
@@ -131,9 +133,3 @@ class MAMLLoss(DDPGLoss):
             .contiguous()
             for key, value in self.meta_network.named_parameters()
         }
-
-    @torch.no_grad()
-    def _keep(self, adapted: Parameters) -> None:
-        kept = self.actor_network_params.flatten_keys(".")
-        for key, value in adapted.items():
-            kept[key].copy_(value)
