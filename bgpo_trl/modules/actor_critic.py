@@ -17,8 +17,6 @@ from torch import Tensor
 from bgpo_trl.errors import missing_key
 from bgpo_trl.modules.stacked_mlp import StackedMLP
 
-__all__ = ["Actor", "Critic", "ProposalPolicy", "StackedNetwork"]
-
 
 class StackedNetwork(TensorDictModuleBase):
     """Base of policies and Q-functions: a perceptron on entries of a TensorDict.

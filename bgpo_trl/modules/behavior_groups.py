@@ -126,19 +126,6 @@ class BehaviorGroups:
         ([0, 1], tensor([ True,  True, False]))
     """
 
-    points: NDArray[np.float64]
-    starts: NDArray[np.float32]
-    shown: NDArray[np.int64]
-    tried: NDArray[np.int64]
-    won: NDArray[np.int64]
-    group: NDArray[np.int64]
-    member: NDArray[np.bool_]
-    cluster: NDArray[np.int64]
-    parent: list[int]
-    links: list[tuple[int, int]]
-    joined: list[int]
-    revision: int
-
     def __init__(
         self, n_features: int, *, smallest: int = 10, evidence: float = 1.0, seed: int = 0
     ) -> None:
@@ -155,7 +142,8 @@ class BehaviorGroups:
         self.shown, self.tried, self.won = (np.empty(0, np.int64) for _ in range(3))
         self.group, self.cluster = (np.empty(0, np.int64) for _ in range(2))
         self._latest = 0  # the demonstration shown last
-        self.parent, self.links, self.joined, self.revision = [0], [], [], 0
+        self.parent, self.joined, self.revision = [0], list[int](), 0
+        self.links = list[tuple[int, int]]()
         # Linear map [d, d] after which distances are measured.
         self._metric = np.eye(self.n_features)
         # By group, the 99 % quantile of its members' distances to their k-th neighbor in it.

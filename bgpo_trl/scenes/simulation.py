@@ -25,8 +25,6 @@ from bgpo_trl.scenes.scene import (
 )
 from bgpo_trl.seeding import Seeding, row_seeds
 
-__all__ = ["RobotEnv", "SimulationEnv"]
-
 
 class SimulationEnv(EnvBase):
     """Simulations of several tasks, one for each element of the batch.
