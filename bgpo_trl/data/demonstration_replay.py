@@ -91,13 +91,10 @@ class DemonstrationReplay:
     def add(
         self, episode: TensorDictBase, reward: Tensor, group: Tensor, mask: Tensor | None = None
     ) -> None:
-        """Store the demonstration of an episode of each seed.
+        """Store the demonstration of an episode of each seed; see `GroupReplay.add`.
 
-        Args:
-            episode: Batch size ``[S]``, with ``"demo_index"`` int64 and the constant entries.
-            reward: Reward of the demonstration's last transition, float32 ``[S]``.
-            group: Group of each demonstration, int64 ``[S]``.
-            mask: Seeds that store theirs, bool ``[S]``; ``None`` for all.
+        ``episode`` has ``"demo_index"`` int64 and the constant entries, ``reward`` float32 ``[S]``
+        is that of the demonstration's last transition.
         """
         self._shown.add(episode.copy().set("reward", reward), group, mask)
 
@@ -115,8 +112,7 @@ class DemonstrationReplay:
             ``"priority_weight"`` and, under ``"next"``, ``"latent"``, ``"reward"``,
             ``"terminated"`` and ``"done"``.
         """
-        sources = self._generators if generator is None else generator
-        entries, reward, frame, left = self._draw_frames(group, sources)
+        entries, reward, frame, left = self._draw_frames(group, generator)
         n_taken = left.clamp(max=self._n_steps)
         ends = (left == n_taken).unsqueeze(-1)
         reward = reward * self._gamma ** (n_taken - 1)
@@ -135,10 +131,9 @@ class DemonstrationReplay:
         self, group: Tensor, *, generator: Sequence[torch.Generator] | None = None
     ) -> dict[NestedKey, Tensor]:
         """Draw latents, with noise, and actions to imitate: as `draw`, without ``"next"``."""
-        sources = self._generators if generator is None else generator
-        entries, _, frame, _ = self._draw_frames(group, sources)
+        entries, _, frame, _ = self._draw_frames(group, generator)
         entries["action"] = (self._pace * entries["action"]).clamp(-1.0, 1.0)
-        return {**entries, self._key: self.blur(self._states(frame), group, sources)}
+        return {**entries, self._key: self.blur(self._states(frame), group, generator)}
 
     def blur(
         self, state: Tensor, group: Tensor, generator: Sequence[torch.Generator] | None = None
@@ -153,14 +148,14 @@ class DemonstrationReplay:
         return latent if self._joints is None else torch.cat([latent, self._joints[frame]], -1)
 
     def _draw_frames(
-        self, group: Tensor, sources: Sequence[torch.Generator]
+        self, group: Tensor, generator: Sequence[torch.Generator] | None
     ) -> tuple[dict[NestedKey, Tensor], Tensor, Tensor, Tensor]:
         """Draw a frame of a demonstration for each row ``[S, *R]``.
 
-        Returns:
-            Action, weight and constant entries by key; the reward of the demonstration; the
-            position of the frame; the number of steps from it to the end.
+        Return action, weight and constant entries by key; the reward of the demonstration; the
+        position of the frame; the number of steps from it to the end.
         """
+        sources = self._generators if generator is None else generator
         shown, steps = self._shown.draw(group, generator=sources), self._steps
         share = draw_for_rows(torch.rand, group, sources, dtype=torch.float64)
         number, constants = shown["demo_index"], shown

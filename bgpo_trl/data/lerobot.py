@@ -385,25 +385,22 @@ class _Reader:
         self, rows: pd.DataFrame, times: NDArray[np.float64], place: Sequence[Any]
     ) -> Iterator[NDArray[np.uint8]]:
         """Return the frames of some rows of an episode, uint8 ``[H, W, 3]``."""
-        if self.is_video:
-            chunk, file, start = place
-            video = self.path / _VIDEO.format(self.image_key, int(chunk), int(file))
-            with _reading(video):
-                if not video.is_file():
-                    raise FileNotFoundError
-                last, end = self._last[chunk, file]
-                seconds = yield from _frames_at(video, start + times, 0.5 / self.fps, end)
-                if seconds > end + 0.5 / self.fps:
-                    self._doubt_film(last, end, f"the film at {seconds:.3f} s")
+        if not self.is_video:
+            for file, row in zip(rows["file"], rows["row"], strict=True):
+                if self._images[0] != file:
+                    column = pq.ParquetFile(file).read([self.image_key]).column(0).to_pylist()
+                    self._images = file, column
+                yield decode_image(self._image(self._images[1][row]))
             return
-        yield from self._stored_images(rows)
-
-    def _stored_images(self, rows: pd.DataFrame) -> Iterator[NDArray[np.uint8]]:
-        for file, row in zip(rows["file"], rows["row"], strict=True):
-            if self._images[0] != file:
-                column = pq.ParquetFile(file).read([self.image_key]).column(0).to_pylist()
-                self._images = file, column
-            yield decode_image(self._image(self._images[1][row]))
+        chunk, file, start = place
+        video = self.path / _VIDEO.format(self.image_key, int(chunk), int(file))
+        with _reading(video):
+            if not video.is_file():
+                raise FileNotFoundError
+            last, end = self._last[chunk, file]
+            seconds = yield from _frames_at(video, start + times, 0.5 / self.fps, end)
+            if seconds > end + 0.5 / self.fps:
+                self._doubt_film(last, end, f"the film at {seconds:.3f} s")
 
     def _image(self, image: Mapping[str, Any]) -> bytes:
         """Return the content of an image, which is in its row or in a file of the dataset."""
@@ -442,14 +439,9 @@ def _some(values: Sequence[Any]) -> str:
 def _frames_at(
     path: Path, times: NDArray[np.float64], tolerance: float, end: float
 ) -> Generator[NDArray[np.uint8], None, float]:
-    """Decode the frames of a video that are nearest to some times (s), which ascend.
+    """Decode the frames nearest to some times (s), which ascend; return when the video ends (s).
 
-    Returns:
-        When the video ends (s), if it says so.
-
-    Raises:
-        ValueError: If the nearest frame is farther than the tolerance, or the video ends before
-            ``end`` (s).
+    Raise `UnreadableError` if one is farther than the tolerance, or the video ends before ``end``.
     """
     av = importlib.import_module("av")
     with av.open(str(path)) as video:

@@ -68,6 +68,8 @@ class GroupReplay:
         self._success_key = success_key
         self._generators = list(generator)
         self._keys, self._source_key = list(keys), source_key
+        further = [key for key in (source_key, success_key) if key is not None]
+        self._stored_keys = [*keys, *further]
         n_seeds = len(self._generators)
         if capacity < 1 or not n_seeds:
             raise ValueError(
@@ -212,9 +214,7 @@ class GroupReplay:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Follow transitions that begin at ``steps`` ``[S, R]`` for up to ``n_steps``.
 
-        Returns:
-            The row of the last step of each, the sum of the discounted rewards, the number of
-            steps, ``[S * R]``.
+        Return the last step's row, the sum of discounted rewards, the number of steps, ``[S * R]``.
         """
         end = np.array([self._n_added[seed] for seed in seeds])[:, None]
         last, goes_on = steps, torch.ones(steps.size, dtype=torch.bool)
@@ -290,11 +290,7 @@ class GroupReplay:
         return entries, entries.pop(_GROUP)
 
     def regroup(self, seed: int, group: Tensor) -> None:
-        """Assign the transitions of a seed to groups anew.
-
-        Args:
-            seed: Position of the seed.
-            group: Group of the transitions of each source, int64 ``[number of sources]``.
+        """Assign the transitions of a seed to groups anew, int64 ``[number of sources]``.
 
         Raises:
             ValueError: If the replay has no ``source_key``.
@@ -308,8 +304,8 @@ class GroupReplay:
 
     def clear(self, seed: int) -> None:
         """Discard the transitions of a seed, given its position."""
-        self._n_added[seed] = self._began[seed] = 0
-        self._index[seed], self._won[seed] = _GroupIndex(), _GroupIndex()
+        self._n_added[seed] = 0
+        self._index_anew(seed)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the filled part of the buffer (a copy) and the states of the generators."""
@@ -343,8 +339,7 @@ class GroupReplay:
                 f"{self.capacity} and {len(self._n_added)}: build it with the saved sizes"
             )
         rows = TensorDict(state_dict["rows"])
-        further = (self._source_key, self._success_key)
-        wanted = {*self._keys, *(key for key in further if key is not None)}
+        wanted = {*self._stored_keys}
         if (there := {*rows.keys(True, True)} - {_GROUP}) and there != wanted:
             raise ValueError(
                 f"the saved replay has {sorted(map(str, there))}, this one stores "
@@ -404,11 +399,9 @@ class GroupReplay:
         stored_numbers = numbers if mask is None else compress(numbers, mask.tolist())
         if min(stored_numbers, default=0) < 0:
             raise ValueError(f"a group must be at least 0, got {numbers}")
-        further = [key for key in (self._source_key, self._success_key) if key is not None]
-        keys = [*self._keys, *further]
-        entries: dict[Any, Tensor] = {key: transition.get(key, None) for key in keys}
+        entries: dict[Any, Tensor] = {key: transition.get(key, None) for key in self._stored_keys}
         if any(entry is None for entry in entries.values()):
-            raise missing_key("GroupReplay", transition, keys)
+            raise missing_key("GroupReplay", transition, self._stored_keys)
         for key in [key for key in self._rows if key != _GROUP]:
             entry, stored = entries.get(key), self._rows[key]
             if entry is None or entry.shape[1:] != stored.shape[1:] or entry.dtype != stored.dtype:
