@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bgpo_trl.scenes.scene import Observation, Outcome, Scene, Simulation, StateColumns
+from bgpo_trl.scenes.scene import Outcome, Scene, Simulation, StateColumns
 from bgpo_trl.scenes.simulation import SimulationEnv
 from bgpo_trl.seeding import random_state, set_random_state
 from suites import nico
@@ -35,7 +35,6 @@ class NicoSimulation(Simulation):
     Attributes:
         environments: Environment of each task, by name.
         task: Name of the current task.
-        timestep: First time step of the episode.
         renderer: Renderer of the frames, which other simulations may share.
     """
 
@@ -137,8 +136,7 @@ class NicoEnv(SimulationEnv):
     Args:
         tasks: Names of the tasks, in the order of their presentation.
         spread: Share of the whole range of start states, from 0 (nominal places) to 1.
-        observation: ``"pixels"``, ``"state"`` or ``"both"``.
-        **options: ``batch_size``, ``seed`` and ``threads`` of `SimulationEnv`; sizes as of `NICO`.
+        **options: ``batch_size``, ``seed``, ``observation`` and ``threads`` of `SimulationEnv`.
 
     Raises:
         ValueError: If a task is unknown or named twice, the spread is out of range, or as for
@@ -155,13 +153,11 @@ class NicoEnv(SimulationEnv):
         tasks: Sequence[str] = nico.PAPER_TASKS,
         *,
         spread: float = 1.0,
-        observation: Observation = "pixels",
         **options: Any,
     ) -> None:
         self._spread = spread
         self._renderer: FrameRenderer | None = None
-        options = {**NICO.sizes, **options}
-        super().__init__(self._make, tasks, observation=observation, **options)
+        super().__init__(self._make, tasks, **{**NICO.sizes, **options})
 
     def _make(self) -> NicoSimulation:
         simulation = self._simulation()
