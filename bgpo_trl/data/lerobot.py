@@ -421,14 +421,13 @@ def _is_depth(feature: Mapping[str, Any]) -> bool:
 
 def _scalars(column: pd.Series) -> NDArray[Any]:
     """Return a column of numbers, of which each may be in a list of its own."""
-    try:
-        return np.array([np.asarray(cell).item() for cell in column])
-    except ValueError:
-        cells = (np.ravel(cell).tolist() for cell in column)
-        wrong = next(cell for cell in cells if len(cell) != 1)
-        raise UnreadableError(
-            f"{column.name} has [{_some(wrong)}] in a row: give one number a row"
-        ) from None
+    cells = [np.ravel(cell).tolist() for cell in column]
+    for cell in cells:
+        if len(cell) != 1:
+            raise UnreadableError(
+                f"{column.name} has [{_some(cell)}] in a row: give one number a row"
+            )
+    return np.array(cells).ravel()
 
 
 def _some(values: Sequence[Any]) -> str:

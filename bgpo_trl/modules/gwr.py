@@ -172,17 +172,17 @@ class GWRB(nn.Module):
             raise ValueError(f"init must be 'random' or 'data'; got {init!r}")
         self.max_nodes, self.init = max_nodes, init
         n_networks = self.batch_size.numel()
-        generators = one_each(generator, n_networks)
         self._topologies = [_Topology(self.config.initial_habituation) for _ in range(n_networks)]
         weights = torch.full((n_networks, 16, self.n_features), torch.inf)
         self.register_buffer("_weights", weights, persistent=False)
         identity = torch.full((n_networks, 16), -1)
         self.register_buffer("_identity", identity, persistent=False)
         if init == "random":
-            for network, source in enumerate(generators):
-                first, second = _random_nodes(self.n_features, source)
-                self._insert(network, first)
-                self._topologies[network].connect(0, self._insert(network, second))
+            for network, topology in enumerate(self._topologies):
+                for row in weights.new_zeros(2, self.n_features):
+                    self._insert(network, row)
+                topology.connect(0, 1)
+        self.redraw(generator)
 
     def redraw(self, generator: torch.Generator | Sequence[torch.Generator] | None = None) -> None:
         """Draw random weights as on construction, in networks that have not learned yet."""
@@ -191,8 +191,9 @@ class GWRB(nn.Module):
             topology = self._topologies[network]
             is_new = topology.next_identity == 2 and topology.habituation == start
             if self.init == "random" and is_new:
-                drawn = _random_nodes(self.n_features, source)
-                self._weights[network, :2] = drawn.to(self._weights)
+                device = None if source is None else source.device
+                drawn = torch.rand(2, self.n_features, generator=source, device=device)
+                self._weights[network, :2] = (2 * drawn - 1).to(self._weights)
 
     @property
     def num_nodes(self) -> Tensor:
@@ -486,17 +487,11 @@ class GWRB(nn.Module):
 
 
 class _Change(NamedTuple):
-    """Changes of a network's weights after an input.
+    """Changes of a network's weights after an input."""
 
-    Attributes:
-        moved: Rows that move towards the input.
-        steps: The fraction of the way that each of these moves.
-        removed: Rows of removed nodes.
-    """
-
-    moved: Sequence[int] = ()
-    steps: Sequence[float] = ()
-    removed: Sequence[int] = ()
+    moved: Sequence[int] = ()  # rows that move towards the input
+    steps: Sequence[float] = ()  # the fraction of the way that each of these moves
+    removed: Sequence[int] = ()  # rows of removed nodes
 
 
 @dataclass(slots=True)
@@ -600,12 +595,6 @@ def _is_sound(network: object) -> bool:
         and bool((ages >= 0).all())
         and bool((node.diff() > 0).all() and (node < next_node).all())
     )
-
-
-def _random_nodes(n_features: int, generator: torch.Generator | None) -> Tensor:
-    """Draw the weights of a network's first two nodes uniformly from (-1, 1), ``[2, d]``."""
-    device = None if generator is None else generator.device
-    return 2 * torch.rand(2, n_features, generator=generator, device=device) - 1
 
 
 def as_tensor(value: Numbers, name: str) -> Tensor:
