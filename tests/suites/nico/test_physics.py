@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from suites import nico
-from suites.nico import kinematics
 from suites.nico.demonstrator import Demonstrator
 from suites.nico.physics import TABLE_HEIGHT, Physics
+from tests.suites.nico.test_tasks import ARM, GRIP, place
 
 
 @pytest.mark.parametrize("task", ["grasp_glass", "push_white_left"])
@@ -53,25 +53,6 @@ def test_a_reloaded_scene_is_queried_and_drawn_as_a_new_one():
     assert env.physics.palm_position().tolist() == fresh.physics.palm_position().tolist()
 
 
-def test_a_state_holds_where_objects_stood_at_the_start(load, physics):
-    env = load("push_green_to_white", seed=0, observation="state")
-    env.reset()
-    start = {name: physics.object_position(name) for name in nico.OBJECTS}
-    demonstrator = Demonstrator(env, seed=0)
-    demonstrator.reset()
-    timestep = env.step(np.zeros(4))
-    while not timestep.last():
-        timestep = env.step(demonstrator(timestep))
-    state = physics.get_state()
-    assert np.abs(physics.object_position("green_box") - start["green_box"]).max() > 0.03
-    env.reset()
-    for name in nico.OBJECTS:
-        np.testing.assert_array_equal(physics.start_position(name), physics.object_position(name))
-    physics.set_state(state)
-    for name in nico.OBJECTS:
-        np.testing.assert_array_equal(physics.start_position(name), start[name])
-
-
 def test_a_state_can_be_restored_within_a_reset(load):
     env = load("push_green_to_white", seed=0, observation="state")
     env.reset()
@@ -98,35 +79,23 @@ def test_parts_of_the_state_can_be_chosen_and_have_their_length(physics):
         physics.set_state(np.zeros(33))
 
 
-GRIP = np.array([0.42, 0.05, TABLE_HEIGHT + 0.045])
-
-
-def put(physics: Physics, name: str, position: np.ndarray, curl: float) -> None:
-    """Put an object at a position, the others out of reach, and the closing hand at `GRIP`."""
-    with physics.reset_context():
-        for number, other in enumerate(nico.OBJECTS):
-            physics.named.data.qpos[other] = [0.45, 0.3 + 0.1 * number, 0.7, 1, 0, 0, 0]
-        physics.named.data.qpos[name][:3] = position
-        physics.data.qpos[:12] = [*kinematics.inverse(GRIP), *[curl] * 9]
-        physics.data.ctrl[:] = [*physics.data.qpos[:3], *[curl + 0.1] * 3]
-
-
 @pytest.mark.parametrize("name", nico.OBJECTS)
 def test_an_object_touched_by_the_palm_from_the_side_is_not_pressed(physics, name):
-    put(physics, name, np.array([GRIP[0], GRIP[1], TABLE_HEIGHT + 0.03]), 0.0)
+    place(physics, {name: (GRIP[0], GRIP[1], TABLE_HEIGHT + 0.03)}, arm=ARM, closing=0.1)
     assert physics.touching("palm", name)
     assert not physics.pressed(name)
 
 
 def test_the_hand_ends_at_the_wrist(physics):
-    put(physics, "white_box", GRIP, 0.0)
-    put(physics, "white_box", physics.named.data.geom_xpos["forearm"].copy(), 0.0)
+    place(physics, arm=ARM)
+    place(physics, {"white_box": physics.named.data.geom_xpos["forearm"].copy()}, arm=ARM)
     assert physics.touching("forearm", "white_box")
     assert not physics.touching("hand", "white_box")
 
 
 def test_the_gap_to_the_hand_is_that_to_its_nearest_part(physics):
-    put(physics, "green_box", np.array([0.42, -0.07, TABLE_HEIGHT + 0.03]), 0.3)
+    box = (0.42, -0.07, TABLE_HEIGHT + 0.03)
+    place(physics, {"green_box": box}, arm=ARM, curls=(0.3,) * 3, closing=0.1)
     digits = ("thumb", "upper_finger", "lower_finger")
     parts = [f"{digit}_{n}" for digit, n in itertools.product(digits, (1, 2, 3))]
     gaps = [physics.gap(part, "green_box") for part in ("palm", "wrist", *parts)]
