@@ -149,15 +149,13 @@ def test_what_is_wrong_is_not_recorded(make, reason, tmp_path):
     assert not [*tmp_path.iterdir()]
 
 
-@pytest.mark.parametrize("method", ["state", "joints"])
-def test_numbers_of_another_size_than_the_scene_says_are_refused(method):
+def test_joints_of_another_size_than_the_scene_says_are_refused():
     class Short(Dot):
-        pass
+        def joints(self):
+            return [self.place]
 
-    setattr(Short, method, lambda self: [self.place])
-    columns = {method: StateColumns(center=[0, 0], scale=[1, 1])}
-    with pytest.raises(ValueError, match=rf"Short.{method}\(\) returned .*: return 2 finite"):
-        check_scene(scene(Short, **columns))
+    with pytest.raises(ValueError, match=r"Short.joints\(\) returned .*: return 2 finite"):
+        check_scene(scene(Short, joints=StateColumns(center=[0, 0], scale=[1, 1])))
 
 
 def test_a_physical_robot_is_not_moved_and_its_connection_is_closed():

@@ -14,9 +14,9 @@ from suites import nico
 from suites.nico.demonstrator import Demonstrator
 
 
-def actions(env: NicoEnv, steps: int, seed: int = 0) -> torch.Tensor:
+def actions(env: NicoEnv, steps: int) -> torch.Tensor:
     """Return actions ``[steps, *B, 4]``."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     return torch.rand(steps, *env.batch_size, 4, generator=generator) * 2 - 1
 
 
