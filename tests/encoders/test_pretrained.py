@@ -165,14 +165,6 @@ def test_a_bank_of_all_tasks_needs_none_beside_the_encoders(tmp_path):
     assert pretrained_for(TASKS, bank, weights=Path(weights))[1].tasks == TASKS
 
 
-@pytest.fixture(scope="module")
-def mixed(shipped):
-    """Demonstrations of a shipped task and of another name."""
-    bank = shipped[1]
-    own = replace(bank.for_tasks([TASKS[0]]), tasks=("juggle",))
-    return (own + bank.for_tasks([TASKS[1]])).for_tasks([TASKS[1], "juggle"])
-
-
 @pytest.mark.parametrize("tasks", [TASKS, TASKS[:0:-1]])
 def test_shipped_demonstrations_are_not_copied(shipped, tmp_path, tasks):
     encoders, bank = shipped
@@ -183,12 +175,10 @@ def test_shipped_demonstrations_are_not_copied(shipped, tmp_path, tasks):
     assert (found.tasks, found.identity) == (tasks, bank.identity)
 
 
-def test_inputs_of_another_run_or_scene_are_refused(shipped, mixed, tmp_path):
+def test_inputs_of_another_run_or_scene_are_refused(shipped, tmp_path):
     encoders, bank = shipped
-    digests = Digests(encoders.identity, mixed.identity)
-    with pytest.raises(ValueError, match="the bank has no demonstration of 'juggle'"):
-        load_inputs(tmp_path, mixed.tasks, digests)
-    with pytest.raises(ValueError, match=f"demonstrations {mixed.identity[:12]}, not") as error:
+    digests = Digests(encoders.identity, "0" * 64)
+    with pytest.raises(ValueError, match="demonstrations 000000000000, not") as error:
         load_inputs(tmp_path / "run", TASKS, digests)
     assert str(error.value).endswith(str(tmp_path / "run" / BANK))
 
