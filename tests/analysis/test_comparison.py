@@ -137,20 +137,6 @@ def test_unfinished_runs_are_left_out(tmp_path):
     assert read_run(path).unfinished == "has no summary"
 
 
-def test_jobs_of_one_run_are_joined_in_the_order_of_their_seeds(tmp_path):
-    for level, seed in enumerate((1, 10, 2)):
-        path = write_run(tmp_path, "bgpo", [level], directory=f"seed-{seed}")
-        edit(path / "config.json", seeds=[seed])
-        rows = (path / "eval.csv").read_text().replace("bgpo,0,", f"bgpo,{seed},")
-        (path / "eval.csv").write_text(rows)
-        edit(path / "summary.json", groups=[level])
-    (setting,) = settings_in(tmp_path)[0].values()
-    (run,) = setting.runs.values()
-    assert run.seeds == (1, 2, 10)
-    assert run.summary["groups"] == [0, 2, 1]
-    assert run.success[:, -1].mean(-1).tolist() == pytest.approx([0, 0.2, 0.1])
-
-
 def test_folders_without_runs_are_refused(tmp_path):
     with pytest.raises(ValueError, match="none is not a directory: name a run"):
         run_directories([tmp_path / "none"])

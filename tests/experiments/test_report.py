@@ -155,9 +155,9 @@ def test_each_file_of_a_run_is_read_once(reported, tmp_path, monkeypatch):
 
 
 def split(run, folder):
-    """Write a run of three seeds as three runs."""
+    """Write a run of three seeds as three runs, whose folders are not in the order of the seeds."""
     for seed in range(3):
-        part = shutil.copytree(run, folder / run.name / f"seeds-{seed}")
+        part = shutil.copytree(run, folder / run.name / f"part-{2 - seed}")
         for name in ("eval.csv", "train.csv", "final.csv"):
             head, *rows = (run / name).read_text().splitlines(keepends=True)
             place = head.split(",").index("seed")
