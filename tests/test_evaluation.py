@@ -166,27 +166,6 @@ def test_test_episodes_equal_a_plain_loop_over_one_environment(
     assert len(result.steps.unique()) > 2
 
 
-def test_contexts_are_behaviors_of_held_out_demonstrations(make, bank):
-    algorithm, evaluator = make()
-    _, by_phi = make(name="without-gwr")
-    raw, _ = make(name="without-gwr", n_steps=1)
-    held_out = bank.held_out()
-    drawn = set()
-    for number in range(5):
-        shown = [4 * s.policy.context for s in take(by_phi, raw, number)]
-        assert not shown[0].equal(shown[1])
-        context = [s.policy.context for s in take(evaluator, algorithm, number)]
-        for index, phi in enumerate(shown):
-            for task in range(3):
-                of_task = held_out.embedding[held_out.task == task]
-                found = (phi[task].unsqueeze(1) == of_task).all(-1)
-                assert found.any(1).all()
-                drawn |= {(task, int(row)) for row in found.nonzero()[:, 1]}
-            phi = phi.expand(2, 3, EPISODES, 32)
-            assert (4 * context[index]).equal(algorithm.gwr.lookup(phi).embedding[index])
-    assert len(drawn) == 12  # in time, all of them
-
-
 @every_kind
 def test_an_evaluation_depends_on_its_number_alone_and_leaves_no_trace(make, name):
     algorithm, evaluator = make(name=name)
