@@ -8,14 +8,14 @@ import pickle
 import resource
 import shutil
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torchrl.record.loggers.common import Logger
 
 from bgpo_trl.configs import (
@@ -49,6 +49,27 @@ TINY_ENCODERS = RepresentationConfig(
 
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 9\n"
 """What Git leaves in place of a file if Git LFS is not installed."""
+
+
+def noise_demonstrations(
+    lengths: Sequence[int], shape: tuple[int, int] = (32, 64), n_actions: int = 4, held_out: int = 1
+) -> TensorDict:
+    """Return demonstrations of noise by three tasks in turn, of which the last are held out."""
+    generator, n, longest = torch.Generator().manual_seed(0), len(lengths), max(lengths)
+    length = torch.tensor([*lengths])
+    inside = torch.arange(longest) < length.unsqueeze(-1)  # beyond, there are zeros
+    pixels = torch.randint(256, (n, longest, *shape, 3), generator=generator, dtype=torch.uint8)
+    action = torch.rand(n, longest - 1, n_actions, generator=generator) * 2 - 1
+    state = torch.randn(n, longest, 16, generator=generator)
+    entries = {
+        "pixels": pixels * inside[:, :, None, None, None],
+        "action": action * inside[:, 1:, None],
+        "state": state * inside[:, :, None],
+        "length": length,
+        "task": torch.arange(n) % 3,
+        "train": torch.arange(n) < n - held_out,
+    }
+    return TensorDict(entries, [n])
 
 
 def contents(folder: Path) -> dict[Path, bytes | None]:

@@ -17,7 +17,7 @@ from bgpo_trl.encoders.mismatch import doubt_frames
 from bgpo_trl.encoders.representation import load_representation, save_representation
 from bgpo_trl.modules.frame_network import FRAME_NETWORKS, FrameNetwork
 from bgpo_trl.scenes.nico import NicoEnv
-from tests.helpers import TINY_ENCODERS, rows
+from tests.helpers import TINY_ENCODERS, noise_demonstrations, rows
 from tests.second_device import second_device
 
 # The first two need data of each task; the last rests after a boundary, with an empty replay.
@@ -99,17 +99,7 @@ class Fields(FrameNetwork):
 def test_encoders_trained_elsewhere_come_back_to_the_cpu(device, tmp_path, frame_network):
     FRAME_NETWORKS["fields"] = Fields
     config = replace(TINY_ENCODERS, frame_network=frame_network)
-    generator = torch.Generator().manual_seed(0)
-    data = TensorDict(
-        {
-            "pixels": torch.randint(0, 256, (4, 3, 32, 64, 3), generator=generator).byte(),
-            "action": torch.rand(4, 2, 4, generator=generator),
-            "length": torch.full((4,), 3),
-            "train": torch.tensor([True, True, True, False]),
-        },
-        [4],
-    )
-    found = []
+    data, found = noise_demonstrations([3] * 4), []
     for place in ("cpu", device):
         trained = train_representation(data, config, scene="noise 1", device=place, progress=False)
         save_representation(trained, tmp_path / "weights.safetensors")

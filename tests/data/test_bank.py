@@ -14,6 +14,7 @@ from bgpo_trl.experiments.arguments import MakeBankArguments
 from bgpo_trl.files.tensor_file import load_tensors, save_tensors
 from suites import nico
 from tests.algorithms.playing import assert_same
+from tests.helpers import noise_demonstrations
 
 LENGTH = torch.tensor([4, 0, 2, 6, 0])
 
@@ -152,15 +153,7 @@ def test_names_of_tasks_differ_and_are_printable(with_steps):
 
 @pytest.fixture
 def dataset():
-    """Two demonstrations of noise to learn from, and one held out."""
-    generator = torch.Generator().manual_seed(4)
-    return {
-        "pixels": torch.randint(256, (3, 5, 32, 64, 3), generator=generator).to(torch.uint8),
-        "action": torch.rand(3, 4, 4, generator=generator) * 2 - 1,
-        "length": torch.tensor([5, 3, 4]),
-        "task": torch.tensor([0, 1, 2]),
-        "train": torch.tensor([True, True, False]),
-    }
+    return noise_demonstrations([5, 3, 4])
 
 
 def test_a_bank_is_made_of_what_the_encoders_see(encoders, dataset):

@@ -17,7 +17,6 @@ import pandas as pd
 import pytest
 import torch
 from PIL import Image
-from tensordict import TensorDict
 
 pa = pytest.importorskip("pyarrow")
 
@@ -30,7 +29,7 @@ from bgpo_trl.data.dataset import (  # noqa: E402
 )
 from bgpo_trl.data.lerobot import read_lerobot  # noqa: E402
 from bgpo_trl.data.lerobot_export import write_lerobot  # noqa: E402
-from tests.helpers import POINTER, edit  # noqa: E402
+from tests.helpers import POINTER, edit, noise_demonstrations  # noqa: E402
 
 TASKS = ("grasp_glass", "push_green_to_white")
 STATE = "observation.environment_state"
@@ -42,17 +41,8 @@ LENGTHS = (5, 2, 4)
 
 def dataset_of(keys=("pixels", "action", "state")):
     """Three demonstrations of noise, of the second, first and second task."""
-    generator = torch.Generator().manual_seed(0)
-    length = torch.tensor(LENGTHS)
-    steps = torch.arange(5) < length.unsqueeze(-1)
-    pixels = torch.randint(256, (3, 5, 32, 64, 3), generator=generator, dtype=torch.uint8)
-    entries = {
-        "pixels": pixels * steps[:, :, None, None, None],
-        "action": (torch.rand(3, 4, 4, generator=generator) * 2 - 1) * steps[:, 1:, None],
-        "state": torch.randn(3, 5, 16, generator=generator) * steps[:, :, None],
-    }
-    chosen = {key: entries[key] for key in keys}
-    return TensorDict({**chosen, "length": length, "task": torch.tensor([1, 0, 1])}, [3])
+    dataset = noise_demonstrations(LENGTHS).select(*keys, "length")
+    return dataset.set("task", torch.tensor([1, 0, 1]))
 
 
 @pytest.fixture
@@ -212,11 +202,6 @@ def saved(image, kind="png"):
         ),
         (without(columns="frame_index"), "damaged or of another format", "frame_index"),
         (replaced(CAMERA, [{"bytes": b"PNG"}] * 11), "episode 0", "is damaged"),
-        (
-            replaced(CAMERA, [{"bytes": saved(Image.new("RGB", (w, 8)))} for w in range(1, 12)]),
-            "episode 0",
-            "differ in size, [8, 1, 3] and [8, 2, 3]: make them alike",
-        ),
         (lambda p: (p / INFO).write_text("[]"), "info.json", "is damaged"),
         (lambda p: (p / INFO).unlink(), "info.json", "give the folder of a whole"),
         (lambda p: shutil.rmtree(p / "data"), "data is missing", "give the folder of a whole"),
@@ -532,8 +517,7 @@ def test_episodes_that_overlap_in_a_video_are_refused(written, film, refused):
     refused(lambda: read_lerobot(written, episodes=[0]), cause, "get it again")
 
 
-@pytest.mark.parametrize("depth", ["gray16le", "yuv420p10le"])
-def test_a_video_of_more_than_eight_bits_a_color_is_refused(written, film, depth):
-    film(pix_fmt=depth, codec="ffv1")
-    with pytest.raises(ValueError, match=f"its frames are {depth}, of more than 8 bits"):
+def test_a_video_of_more_than_eight_bits_a_color_is_refused(written, film):
+    film(pix_fmt="yuv420p10le", codec="ffv1")
+    with pytest.raises(ValueError, match="its frames are yuv420p10le, of more than 8 bits"):
         read_lerobot(written)

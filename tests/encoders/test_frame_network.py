@@ -5,10 +5,8 @@ import json
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
 
 from bgpo_trl.encoders.fitting import train_representation
 from bgpo_trl.encoders.representation import (
@@ -22,7 +20,7 @@ from bgpo_trl.encoders.representation import (
 from bgpo_trl.encoders.train import train_encoders
 from bgpo_trl.modules.frame_network import FRAME_NETWORKS, FrameNetwork
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
-from tests.helpers import TINY_ENCODERS, rows
+from tests.helpers import TINY_ENCODERS, noise_demonstrations, rows
 from tests.scenes.dot import SavedDot, scene
 
 NAME = "columns"
@@ -53,41 +51,29 @@ def registered(restored_registries):
     FRAME_NETWORKS[NAME] = Columns
 
 
-def movies(n=12):
-    """Demonstrations of a column of light that goes to the left or to the right."""
-    random = np.random.default_rng(0)
-    pixels = np.zeros((n, 9, 16, 24, 3), np.uint8)
-    action = np.zeros((n, 8, 1), np.float32)
-    length, task = random.integers(5, 10, n), np.arange(n) % 2
-    for i in range(n):
-        place = random.integers(8, 14)
-        for t in range(length[i]):
-            pixels[i, t, :, place : place + 3] = 255
-            if t < length[i] - 1:
-                move = (1 if task[i] else -1) * random.integers(0, 3)
-                action[i, t], place = move / 2, np.clip(place + move, 0, 21)
-    found = {"pixels": pixels, "action": action, "length": length, "task": task}
-    entries = {key: torch.from_numpy(values) for key, values in found.items()}
-    return TensorDict({**entries, "train": torch.arange(n) < 0.75 * n}, [n])
+def shown():
+    """Demonstrations of two tasks, 53 frames of them to learn from."""
+    dataset = noise_demonstrations([5, 7] * 6, DOT.frame_shape, DOT.action_size, held_out=3)
+    return dataset.exclude("state").set("task", torch.arange(12) % 2)
 
 
-def train(dataset=None, config=TINY, **options):
+def train(config=TINY, **options):
     options = {"scene": DOT.identity, "progress": False, **options}
-    return train_representation(movies() if dataset is None else dataset, config, **options)
+    return train_representation(shown(), config, **options)
 
 
 def test_it_stays_as_it_is_and_its_latents_are_standardized():
     before = torch.get_rng_state()
-    encoders, dataset = train(), movies()
+    encoders = train()
     assert torch.get_rng_state().equal(before)
     network = encoders.frame_network
     assert type(network) is Columns and not network.training
     assert not any(weights.requires_grad for weights in encoders.frame_network.parameters())
     assert network.norm.running_mean.eq(0).all() and network.norm.num_batches_tracked == 0
-    shown, _ = split(dataset)
-    features = network.features(valid_frames(shown))
-    latent = encode_frames(network, shown)
-    valid = valid_steps(shown["length"], latent.shape[1])
+    learned, _ = split(shown())
+    features = network.features(valid_frames(learned))
+    latent = encode_frames(network, learned)
+    valid = valid_steps(learned["length"], latent.shape[1])
     std = features.std(0)
     expected = (features - features.mean(0)) / std.clamp_min(0.1 * std.max())
     torch.testing.assert_close(latent[valid], expected)
@@ -97,7 +83,7 @@ def test_it_stays_as_it_is_and_its_latents_are_standardized():
 def test_what_is_of_the_vae_alone_is_left_out(tmp_path):
     options = {"tasks": DOT.default_tasks, "scene": DOT, "progress": False}
     with pytest.warns(UserWarning) as caught:  # of the other encoders
-        train_encoders(movies(), None, tmp_path / "weights", tmp_path, TINY, **options)
+        train_encoders(shown(), None, tmp_path / "weights", tmp_path, TINY, **options)
     assert not any("reconstruct" in str(warning.message) for warning in caught)
     assert not (tmp_path / "reconstructions.png").exists()
     assert not any(
@@ -114,7 +100,7 @@ def test_a_file_holds_it_and_its_module_makes_it_again(tmp_path):
     newer = type("Columns", (Columns,), {"identity": f"{NAME} 2"})((16, 24))
     newer.load_state_dict(encoders.frame_network.state_dict())
     assert replace(encoders, frame_network=newer).identity != encoders.identity
-    frames = movies()["pixels"]
+    frames = shown()["pixels"]
     assert read.frame_network.latent(frames).equal(encoders.frame_network.latent(frames))
     assert not read.frame_network.training
     with pytest.raises(ValueError, match=r"has frames of \[16, 24\] .* the scene \[16, 26\]"):
@@ -145,7 +131,7 @@ def test_a_network_of_torchvision_comes_back_from_its_file(tmp_path):
     assert type(network) is made and network.latent_size == 128
     save_representation(encoders, path)
     read = load_representation(path, scene=DOT)
-    frames = movies()["pixels"][:, 0]
+    frames = shown()["pixels"][:, 0]
     latent = read.frame_network.latent(frames)
     assert latent.equal(network.latent(frames)) and latent.std(0).min() > 0
     torch.testing.assert_close(read.frame_network.latent(frames[3:4]), latent[3:4])
@@ -229,8 +215,8 @@ class Constant(Columns):
         (type("Odd", (Columns,), {"identity": "odd 1"}), "identity of Odd is .* got 'odd 1'"),
         (type("Odd", (Columns,), {"identity": NAME}), "such as 'columns 1', got 'columns'"),
         (Constant, "features of frames are constant or not finite"),
-        (Short, r"Short.features\(\) must return \[56, 24\] for 56 frames, got \[55, 24\]"),
-        (Narrow, r"features must be \[N, 24\], N >= 2, got \[56, 3\]"),
+        (Short, r"Short.features\(\) must return \[53, 24\] for 53 frames, got \[52, 24\]"),
+        (Narrow, r"features must be \[N, 24\], N >= 2, got \[53, 3\]"),
     ],
 )
 def test_what_is_no_frame_network_is_refused_before_training(entry, cause):

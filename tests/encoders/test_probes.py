@@ -30,22 +30,11 @@ from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.scenes.nico import NICO
+from tests.helpers import noise_demonstrations
 
 
 def demonstrations(n: int = 6) -> TensorDict:
-    generator = torch.Generator().manual_seed(0)
-    shape = (n, 51, 32, 64, 3)
-    return TensorDict(
-        {
-            "pixels": torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator),
-            "action": torch.rand(n, 50, 4, generator=generator),
-            "length": torch.arange(n) + 2,
-            "state": torch.rand(n, 51, 16, generator=generator),
-            "task": torch.arange(n) % 3,
-            "train": torch.arange(n) < n - 2,
-        },
-        [n],
-    )
+    return noise_demonstrations(range(2, 2 + n), held_out=2)
 
 
 @pytest.fixture
@@ -162,7 +151,7 @@ def test_probes_are_not_fitted_on_held_out_demonstrations(untrained: Representat
     data["state"][data["train"]] = 0.5
     result = probe(untrained, data, columns=NICO.state)
     error = data["state"][4:, :, 0] - 0.5
-    valid = torch.arange(51) < data["length"][4:].unsqueeze(-1)
+    valid = torch.arange(7) < data["length"][4:].unsqueeze(-1)
     expected = error[valid].square().mean().sqrt().item()
     assert result["joint_yaw_rmse_rad"] == pytest.approx(expected, rel=1e-3)
 
@@ -170,7 +159,7 @@ def test_probes_are_not_fitted_on_held_out_demonstrations(untrained: Representat
 def test_frames_beyond_the_length_do_not_count(untrained: Representation) -> None:
     data = demonstrations()
     expected = probe(untrained, data, columns=NICO.state)
-    beyond = torch.arange(51) >= data["length"].unsqueeze(-1)
+    beyond = torch.arange(7) >= data["length"].unsqueeze(-1)
     data["pixels"][beyond] = 7
     data["state"][beyond] = 1e6
     data["action"][beyond[:, 1:]] = 1e6
