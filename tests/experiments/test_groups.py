@@ -7,8 +7,18 @@ from bgpo_trl.configs.runs import PAPER_TASKS
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.experiments import groups
 from bgpo_trl.transforms import TaskSchedule
-from tests.experiments.places import places
 from tests.helpers import cells
+
+
+def places(*centers):
+    """A bank with one task around each center, every fourth demonstration held out."""
+    generator = torch.Generator().manual_seed(1)
+    task = torch.arange(len(centers)).repeat_interleave(40)
+    noise = 0.05 * torch.randn(len(task), 2, generator=generator)
+    embedding = torch.tensor(centers)[task] + noise
+    train = torch.arange(len(task)) % 4 != 0
+    names = tuple(f"task{i}" for i in range(len(centers)))
+    return DemonstrationBank(embedding, task, train, names)
 
 
 def test_draws_are_of_the_tasks_available():

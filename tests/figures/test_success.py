@@ -46,9 +46,9 @@ def runs() -> dict[str, Run]:
     return dict.fromkeys(("BGPO", "MAML", "Dist-NLL"), run)
 
 
-def curve(axes: Axes, index: int = 0) -> dict[int, float]:
+def curve(axes: Axes) -> dict[int, float]:
     """Returns the mean by episode, where there is one."""
-    x, y = axes.lines[index].get_data()
+    x, y = axes.lines[0].get_data()
     return {int(a): float(b) for a, b in zip(x, y, strict=True) if np.isfinite(b)}
 
 

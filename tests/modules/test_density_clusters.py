@@ -24,11 +24,11 @@ def test_a_repeated_point_is_refused():
             density_clusters(repeated)
 
 
-def blobs(sizes, d=6, seed=0):
+def blobs(sizes, seed=0):
     """Gaussian blobs of unit variance, nine times their deviation from the origin."""
     rng = np.random.default_rng(seed)
     labels = np.repeat(np.arange(len(sizes)), sizes)
-    return CENTERS[labels][:, :d] + rng.normal(size=(len(labels), d)), labels
+    return CENTERS[labels] + rng.normal(size=(len(labels), 6)), labels
 
 
 @settings(max_examples=20)

@@ -89,18 +89,18 @@ def assert_same_network(graph, reference, **tolerance):
     torch.testing.assert_close(graph.habituation, habituation, rtol=1e-9, atol=0)
 
 
-def drifting_inputs(n, *shape, seed=0):
+def drifting_inputs(n, *shape):
     """Noisy random walk, so that nodes fall out of use and are removed; float64 [n, *shape]."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     walk, noise = torch.randn(2, n, *shape, generator=generator, dtype=torch.float64)
     return (0.1 * walk).cumsum(0).tanh() + 0.05 * noise
 
 
-def grown(*shape, n=300, seed=0, config=GROWING, **options):
+def grown(*shape):
     """Networks that have inserted and removed nodes."""
-    generator = torch.Generator().manual_seed(seed)
-    gwr = GWRB(shape[-1], config, batch_size=shape[:-1], generator=generator, **options)
-    for phi in drifting_inputs(n, *shape):
+    generator = torch.Generator().manual_seed(0)
+    gwr = GWRB(shape[-1], GROWING, batch_size=shape[:-1], generator=generator)
+    for phi in drifting_inputs(300, *shape):
         gwr.adapt(phi)
     return gwr
 

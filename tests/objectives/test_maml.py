@@ -23,19 +23,18 @@ def transitions(*shape, seed=0):
     return TensorDict(data, shape)
 
 
-def stack_loss(n_seeds=2, **arguments):
+def stack_loss(**arguments):
     """A loss of stacked networks in which all tasks' Q-functions differ, in double precision."""
     arguments = {"inner_learning_rate": 0.1, **arguments}
-    stack = [] if n_seeds is None else [n_seeds]
     network = {"in_keys": ["state"], "hidden_sizes": (8,)}
     generator = torch.Generator().manual_seed(1)
     loss = MAMLLoss(
-        Actor(N_STATES, N_ACTIONS, batch_size=stack, generator=generator, **network),
-        Actor(N_STATES, N_ACTIONS, batch_size=[*stack, TASKS], generator=generator, **network),
+        Actor(N_STATES, N_ACTIONS, batch_size=[2], generator=generator, **network),
+        Actor(N_STATES, N_ACTIONS, batch_size=[2, TASKS], generator=generator, **network),
         Critic(
             *(N_STATES, N_ACTIONS),
             layer_norm=True,
-            batch_size=[*stack, TASKS],
+            batch_size=[2, TASKS],
             generator=generator,
             **network,
         ),

@@ -37,8 +37,8 @@ class HandVAE(nn.Module):
         return z_next - z
 
 
-def windows(n: int = 2, k: int = 3, n_actions: int = 4, seed: int = 0) -> TensorDict:
-    generator = torch.Generator().manual_seed(seed)
+def windows(n: int = 2, k: int = 3, n_actions: int = 4) -> TensorDict:
+    generator = torch.Generator().manual_seed(0)
     pixels = torch.randint(0, 256, (n, k, 32, 64, 3), dtype=torch.uint8, generator=generator)
     action = torch.rand(n, k, n_actions, generator=generator) * 2 - 1
     return TensorDict({"pixels": pixels, "action": action}, [n, k])

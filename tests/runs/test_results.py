@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from bgpo_trl.runs.results import COLUMNS, archive_run, read_run, read_table
-from tests.analysis.runs import write_run, write_training
+from tests.analysis.runs import HEAD, write_run, write_training
 from tests.helpers import edit
 
 NAN = np.nan
-HEAD = "algorithm,seed,episode,env_steps,task,success,return,steps\n"
 
 
 def test_success_is_read_by_seed_evaluation_and_task(tmp_path):
