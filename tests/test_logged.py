@@ -151,6 +151,8 @@ def test_an_interrupted_run_equals_one_that_is_not(begin, logged_config, log, tm
     run = tmp_path / "run"
     trainer = begin(run, config, logged=log)
     interrupt_call(trainer, trainer.algorithm, "store_logged", 8)
+    trainer = begin(run, config, logged=log, resume=True)
+    interrupt_call(trainer, trainer.algorithm.learner, "learn", 2)
     interrupt(begin(run, config, logged=log, resume=True), N_STEPS + 5)
     shutil.rmtree(log)  # learned before the first checkpoint
     finish(begin(run, config, resume=True))

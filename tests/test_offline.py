@@ -5,11 +5,8 @@ import torch
 from tensordict import TensorDict
 
 from bgpo_trl.algorithms import entry
-from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.training import Trainer
 from tests.algorithms.playing import assert_same
-from tests.helpers import finish, interrupt, interrupt_call, rows
-from tests.test_training import assert_same_run
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 N = 7  # odd, since the actor learns in every other update
@@ -95,19 +92,6 @@ def test_seeds_learn_alone_what_they_learn_beside_others(
         for key, value in ours.items():
             torch.testing.assert_close(value, theirs[key], rtol=0, atol=1e-6)
         assert any((value != first[key]).any() for key, value in ours.items())
-
-
-def test_an_interrupted_run_equals_one_that_is_not(begin, offline_config, tmp_path):
-    finish(begin(tmp_path / "straight", offline_config()))
-    run = tmp_path / "run"
-    trainer = begin(run, offline_config())
-    interrupt_call(trainer, trainer.algorithm.learner, "learn", N // 2)
-    interrupt(begin(run, offline_config(), resume=True), 5)
-    finish(begin(run, offline_config(), resume=True))
-    assert_same_run(run, tmp_path / "straight")
-    first = rows(run / "train.csv")[0]
-    assert float(first["loss_value"]) > 0
-    assert load_checkpoint(run / "checkpoint")["settings"]["offline_updates"] == N
 
 
 @pytest.mark.parametrize("name", ["bgpo-experts", "maml-demonstrations", "dist-nll"])

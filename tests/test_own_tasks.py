@@ -89,15 +89,6 @@ def test_bad_names_and_classes_of_tasks_are_refused():
     assert dict(nico.TASKS) == before
 
 
-def test_a_run_does_not_depend_on_tasks_that_are_not_in_it(begin, make_config, tmp_path):
-    config, known = make_config("state", "oracle"), bank_of(*nico.PAPER_TASKS)
-    for folder, bank in (("alone", known), ("beside", known + bank_of("at_once"))):
-        begin(tmp_path / folder, config, bank=bank, encoders=None).run()
-    for name in ("train.csv", "eval.csv"):
-        alone, beside = ((tmp_path / run / name).read_text() for run in ("alone", "beside"))
-        assert alone == beside
-
-
 def test_a_run_is_resumed_with_its_demonstrations_from_whatever_module(
     begin, make_config, tmp_path
 ):
