@@ -179,14 +179,26 @@ def test_an_update_follows_every_so_many_steps(begin, make_config, tmp_path):
     assert calls == [*range(0, trainer.env_steps, 3)]  # transitions stored before
 
 
-def test_a_longer_run_logs_the_episodes_of_seeds_that_were_ahead(begin, make_config, tmp_path):
-    config, short, long = make_config("state", "ddpg"), Recorder(), Recorder()
-    begin(tmp_path / "run", replace(config, episodes=4)).run()
-    assert load_checkpoint(tmp_path / "run" / "checkpoint")["later"]
-    finish(begin(tmp_path / "run", config, resume=True, loggers=[short]))
-    finish(begin(tmp_path / "whole", config, loggers=[long]))
-    assert [step for _, step in short.metrics] == [6, 8, 10]
-    assert short.metrics == long.metrics[-3:]
+def test_a_run_extended_in_steps_equals_a_longer_run(begin, make_config, tmp_path):
+    """Seeds that were done early have gone on; nothing of that is lost, nor on a dashboard."""
+    run, straight = tmp_path / "longer", tmp_path / "straight"
+    config, whole, parts = make_config(episodes=16), Recorder(), [Recorder(), Recorder()]
+    finish(begin(straight, config, loggers=[whole]))
+    for episodes in (12, 13):
+        finish(begin(run, replace(config, episodes=episodes), resume=True))
+        played = sorted((row["seed"], int(row["episode"])) for row in rows(run / "train.csv"))
+        assert played == [(seed, n + 1) for seed in "38" for n in range(episodes)]
+        assert load_checkpoint(run / "checkpoint")["later"]
+    interrupt(begin(run, config, resume=True, loggers=parts[:1]), 1)
+    finish(begin(run, config, resume=True, loggers=parts[1:]))
+    assert [step for part in parts for _, step in part.metrics] == [14, 16]
+    assert parts[0].metrics + parts[1].metrics == whole.metrics[-2:]
+    for file in CSV_FILES:
+        # Episodes that were played early are logged late.
+        lines = [sorted((folder / file).read_text().splitlines()) for folder in (run, straight)]
+        assert lines[0] == lines[1]
+    assert (run / "config.json").read_text() == (straight / "config.json").read_text()
+    assert_same(*(load_checkpoint(folder / "checkpoint") for folder in (run, straight)))
 
 
 @pytest.mark.parametrize(

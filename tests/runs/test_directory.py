@@ -10,8 +10,7 @@ import pytest
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.runs.directory import open_tables
 from bgpo_trl.scenes import SCENES, find_scene
-from tests.algorithms.playing import assert_same
-from tests.helpers import CHECKPOINTS, UNPICKLED, edit, finish, interrupt, put_checkpoint, rows
+from tests.helpers import CHECKPOINTS, UNPICKLED, edit, interrupt, put_checkpoint
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 
@@ -98,26 +97,6 @@ def test_sizes_that_are_not_the_checkpoints_take_no_memory(
     resume = partial(begin, run, config, resume=True)
     cause = f"checkpoint holds a run with other settings (algorithm.rl.{name} is"
     refused(resume, cause, "choose another run directory")
-
-
-def test_a_run_extended_in_steps_equals_a_longer_run(begin, make_config, tmp_path):
-    """Seeds that were done early have gone on, and nothing of that is lost."""
-    run, straight = tmp_path / "longer", tmp_path / "straight"
-    config = make_config(episodes=16)
-    finish(begin(straight, config))
-    for episodes in (12, 13):
-        finish(begin(run, replace(config, episodes=episodes), resume=True))
-        played = sorted((row["seed"], int(row["episode"])) for row in rows(run / "train.csv"))
-        assert played == [(seed, n + 1) for seed in "38" for n in range(episodes)]
-        assert load_checkpoint(run / "checkpoint")["later"]
-    interrupt(begin(run, config, resume=True), 1)
-    finish(begin(run, config, resume=True))
-    for file in ("train.csv", "eval.csv"):
-        # Episodes that were played early are logged late.
-        lines = [sorted((folder / file).read_text().splitlines()) for folder in (run, straight)]
-        assert lines[0] == lines[1]
-    assert (run / "config.json").read_text() == (straight / "config.json").read_text()
-    assert_same(*(load_checkpoint(folder / "checkpoint") for folder in (run, straight)))
 
 
 def test_a_column_that_is_there_already_is_refused(tmp_path):
