@@ -9,8 +9,11 @@ import resource
 import shutil
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from fractions import Fraction
+from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -207,6 +210,41 @@ def spied(owner: Any, name: str, patch: pytest.MonkeyPatch | None = None) -> lis
 
     (patch.setattr if patch else setattr)(owner, name, call)
     return calls
+
+
+class FilmStandIn(ModuleType):
+    """The part of PyAV that reads a film, of frames by number; the only keyframe is the first."""
+
+    def __init__(self, shown, fps, pix_fmt="yuv420p", *, n_streams=1, corrupt=None, **container):
+        super().__init__("av")
+        self.__spec__ = ModuleSpec("av", None)
+        self.shown, self.fps, self.corrupt = shown, fps, corrupt
+        bits = SimpleNamespace(bits=8 if pix_fmt == "yuv420p" else 16)
+        stream = SimpleNamespace(
+            format=SimpleNamespace(name=pix_fmt, components=[bits]),
+            average_rate=Fraction(fps),
+            time_base=Fraction(1, fps),
+            start_time=0,
+            duration=max(shown) + 1,
+        )
+        self.streams = type("Streams", (list,), {"video": [stream]})([stream] * n_streams)
+        vars(self).update(container)
+
+    def open(self, file):
+        assert Path(file).exists()
+        return nullcontext(self)
+
+    def seek(self, start, stream): ...
+
+    def decode(self, stream=None, video=0):
+        for number, pixels in self.shown.items():
+            yield SimpleNamespace(
+                time=number / self.fps,
+                is_corrupt=number == self.corrupt,
+                side_data={},
+                format=SimpleNamespace(components=()),
+                to_ndarray=lambda format, pixels=pixels: pixels,
+            )
 
 
 class Recorder(Logger):

@@ -5,12 +5,7 @@ import io
 import json
 import shutil
 import sys
-from contextlib import nullcontext
-from fractions import Fraction
 from functools import partial
-from importlib.machinery import ModuleSpec
-from pathlib import Path
-from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -29,7 +24,7 @@ from bgpo_trl.data.dataset import (  # noqa: E402
 )
 from bgpo_trl.data.lerobot import read_lerobot  # noqa: E402
 from bgpo_trl.data.lerobot_export import write_lerobot  # noqa: E402
-from tests.helpers import POINTER, edit, noise_demonstrations  # noqa: E402
+from tests.helpers import POINTER, FilmStandIn, edit, noise_demonstrations  # noqa: E402
 
 TASKS = ("grasp_glass", "push_green_to_white")
 STATE = "observation.environment_state"
@@ -385,36 +380,6 @@ def encode(file, kept, pix_fmt, codec):
         video.mux(stream.encode())
 
 
-class StandIn(ModuleType):
-    """The part of PyAV that reads a film, whose only keyframe is the first, for where it lacks."""
-
-    def __init__(self, kept, pix_fmt):
-        super().__init__("av")
-        self.__spec__ = ModuleSpec("av", None)
-        self.kept, self.corrupt = [*kept], None
-        bits = 8 if pix_fmt == "yuv420p" else 16
-        stream = SimpleNamespace(
-            format=SimpleNamespace(name=pix_fmt, components=[SimpleNamespace(bits=bits)]),
-            time_base=Fraction(1, 5),
-            start_time=0,
-            duration=self.kept[-1] + 1,
-        )
-        self.streams = SimpleNamespace(video=[stream])
-
-    def open(self, file):
-        assert Path(file).exists()
-        return nullcontext(self)
-
-    def seek(self, start, stream): ...
-
-    def decode(self, stream):
-        for number in self.kept:
-            shown = np.full((32, 64, 3), GRAYS[number], np.uint8)
-            frame = {"time": number / 5, "side_data": {}, "format": SimpleNamespace(components=())}
-            frame["is_corrupt"] = number == self.corrupt
-            yield SimpleNamespace(**frame, to_ndarray=lambda format, shown=shown: shown)
-
-
 @pytest.fixture
 def film(written, monkeypatch):
     """Turns the images of a dataset into a film, in which the first episode ends at 1 s."""
@@ -426,7 +391,8 @@ def film(written, monkeypatch):
             encode(file, kept, pix_fmt, codec)
         else:
             file.touch()
-            monkeypatch.setitem(sys.modules, "av", StandIn(kept, pix_fmt))
+            shown = {number: np.full((32, 64, 3), GRAYS[number], np.uint8) for number in kept}
+            monkeypatch.setitem(sys.modules, "av", FilmStandIn(shown, 5, pix_fmt))
         without(columns=CAMERA)(written)
         places = {"chunk_index": 0, "file_index": 0, "from_timestamp": (0.0, 1.0, 1.4)}
         places = {f"videos/{CAMERA}/{key}": value for key, value in places.items()}
@@ -462,7 +428,7 @@ def test_episodes_of_other_sizes_are_not_squeezed_into_one(written, refused):
 
 def test_a_damaged_video_is_refused(written, film, refused):
     path = film()
-    if isinstance(stand_in := sys.modules["av"], StandIn):
+    if isinstance(stand_in := sys.modules["av"], FilmStandIn):
         stand_in.corrupt = 2
     else:
         content = bytearray(path.read_bytes())

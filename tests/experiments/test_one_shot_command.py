@@ -2,8 +2,6 @@
 
 import sys
 from collections import Counter
-from contextlib import nullcontext
-from fractions import Fraction
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,7 +15,7 @@ from bgpo_trl.experiments import watch
 from bgpo_trl.experiments.arguments import OneShotArguments
 from bgpo_trl.experiments.watch import one_shot
 from bgpo_trl.scenes import SimulationEnv
-from tests.helpers import POINTER
+from tests.helpers import POINTER, FilmStandIn
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 FRAMES = np.random.default_rng(0).integers(256, size=(11, 64, 128, 3), dtype=np.uint8)
@@ -147,27 +145,9 @@ def test_a_film_that_is_damaged_or_cut_off_is_refused(
     tmp_path, monkeypatch, refused, changes, cause
 ):
     """Here in place of PyAV's."""
-    given = {"start_time": 0, "duration": 5e5, "n_streams": 1, "corrupt": None, **changes}
+    given = {"start_time": 0, "duration": 5e5, **changes}
     (tmp_path / "a.mkv").touch()
-    camera = SimpleNamespace(format=SimpleNamespace(components=()), average_rate=Fraction(10))
-    streams = type("Streams", (list,), {"video": [camera]})([camera] * given["n_streams"])
-    frames = [
-        SimpleNamespace(
-            time=number / 10,
-            is_corrupt=number == given["corrupt"],
-            side_data={},
-            format=camera.format,
-            to_ndarray=lambda format, number=number: FRAMES[number],
-        )
-        for number in range(5)
-    ]
-    opened = SimpleNamespace(
-        streams=streams,
-        duration=given["duration"],
-        start_time=given["start_time"],
-        decode=lambda video: iter(frames),
-    )
-    monkeypatch.setitem(sys.modules, "av", SimpleNamespace(open=lambda _: nullcontext(opened)))
+    monkeypatch.setitem(sys.modules, "av", FilmStandIn(dict(enumerate(FRAMES[:5])), 10, **given))
     if cause is None:
         np.testing.assert_array_equal([*read_film(tmp_path / "a.mkv")], FRAMES[:5])
     else:
