@@ -53,6 +53,9 @@ CONFIG = RepresentationConfig(
 )
 ALL_ACTIONS = replace(TINY_ENCODERS.inverse, largest_action=1.0)
 TINY = replace(TINY_ENCODERS, inverse=ALL_ACTIONS, checkpoint_every=1, log_every=2)
+LIMITED = replace(TINY, inverse=replace(TINY.inverse, largest_action=0.6))
+ROBOT = scene(frame_shape=(32, 64), action_size=4, tasks=("left", "right", "up"))
+OF_ROBOT = {"scene": ROBOT, "tasks": ROBOT.tasks, "progress": False}
 DIRECTIONS = np.array([[1, 0, 0, 0], [-1, 0, 0, 1], [0, 1, -1, 0]])  # of both squares, by task
 
 
@@ -251,15 +254,14 @@ def test_actions_that_the_inverse_model_would_never_see_are_refused_before_train
     seen = bold[bold["train"]]
     steps = [seen["action"][row, : length - 1] for row, length in enumerate(seen["length"])]
     large = f"{(torch.cat(steps).abs().amax(-1) > 0.6).double().mean():.0%}"
-    limited = replace(TINY, inverse=replace(TINY.inverse, largest_action=0.6))
     for part, share in ((with_a_gripper(8), "100%"), (bold, large)):
         match = f"largest_action 0.6 leaves {share} of the actions out, most by component .,"
         for play in (None, squares(8)):
             with pytest.raises(ValueError, match=match):
-                train(part, limited, play=play, log=log.append)
+                train(part, LIMITED, play=play, log=log.append)
     with pytest.raises(ValueError, match="leaves 100% of the actions out, most by component 3"):
         play = with_a_gripper(8)
-        train(squares(8).exclude("action"), limited, play=play, log=log.append)
+        train(squares(8).exclude("action"), LIMITED, play=play, log=log.append)
     assert not log
 
 
@@ -270,38 +272,33 @@ def test_steps_of_play_that_are_left_out_are_told_unless_demonstrations_have_non
     play["action"][..., 3] = 0.5
     play["action"][:, :2, 1] = -1.0
     share = 2 / float((play["length"][play["train"]] - 1).double().mean())
-    shown, limited = play.clone(), replace(TINY, inverse=replace(TINY.inverse, largest_action=0.6))
+    shown = play.clone()
     shown["action"].clamp_(-0.5, 0.5)
     told = (
         f"leaves {share:.0%} of the actions out, most by component 1, .* if demonstrations have n"
     )
     with pytest.warns(UserWarning, match=told):
-        train(shown.exclude("action"), limited, play=play)
+        train(shown.exclude("action"), LIMITED, play=play)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", "largest_action")
-        train(shown, limited, play=play)
+        train(shown, LIMITED, play=play)
 
 
 def test_actions_beyond_the_largest_teach_the_inverse_model_nothing(tiny: Representation) -> None:
-    limited = replace(TINY, inverse=replace(TINY.inverse, largest_action=0.6))
     play = squares(10)
     turned, large = play.clone(), play["action"].abs().amax(-1, keepdim=True) > 0.6
     turned["action"] = torch.where(large, -play["action"], play["action"])
-    first, second = (retrain_inverse(tiny, p, limited, progress=False) for p in (play, turned))
+    first, second = (retrain_inverse(tiny, p, LIMITED, progress=False) for p in (play, turned))
     assert same(first, second)
 
 
 def test_actions_of_any_size_are_learned_from_and_recorded_ones_are_used(tmp_path: Path) -> None:
     """NICO's limit, below which all its demonstrators stay, is NICO's alone."""
-    robot = scene(frame_shape=(32, 64), action_size=4)
     shown = with_a_gripper(8)
     config = replace(TINY, inverse=replace(TINY.inverse, largest_action=None))
-    options = {"scene": robot, "tasks": ("left", "right", "up"), "progress": False}
-    robot = replace(robot, tasks=options["tasks"])
+    parts = (shown, None, tmp_path / "weights", tmp_path / "run", config)
     with pytest.warns(UserWarning) as caught:
-        trained, bank = train_encoders(
-            shown, None, tmp_path / "weights", tmp_path / "run", config, **options
-        )
+        trained, bank = train_encoders(*parts, **OF_ROBOT)
     assert not any("actions inferred" in str(warning.message) for warning in caught)
     assert json.loads(trained.metadata["config"])["inverse"]["largest_action"] == 1.0
     assert trained.inverse is not None and bank.steps is not None
@@ -309,9 +306,9 @@ def test_actions_of_any_size_are_learned_from_and_recorded_ones_are_used(tmp_pat
     kept = bank.steps.actions(moves + bank.steps.first[0])
     torch.testing.assert_close(kept, shown["action"][0, moves], rtol=0, atol=0.5 / 127)
     assert kept[:, 3].unique().tolist() == [1.0]
-    inferred = make_bank(trained, shown, tasks=options["tasks"], actions="inferred")
+    inferred = make_bank(trained, shown, tasks=ROBOT.tasks, actions="inferred")
     assert not inferred.steps.action.equal(bank.steps.action)
-    unknown = make_bank(trained, shown.exclude("action"), tasks=options["tasks"])
+    unknown = make_bank(trained, shown.exclude("action"), tasks=ROBOT.tasks)
     assert unknown.steps.action.equal(inferred.steps.action)
 
 
@@ -321,12 +318,10 @@ def test_recorded_actions_are_compared_with_inferred_ones_if_play_tells_them(
     """Else, the inverse model has learned from these very actions."""
     monkeypatch.setattr("bgpo_trl.encoders.train.mismatch", lambda *_: "actions are turned round")
     shown = with_a_gripper(8)
-    robot = replace(scene(frame_shape=(32, 64), action_size=4), tasks=("left", "right", "up"))
-    options: dict[str, Any] = {"scene": robot, "tasks": robot.tasks, "progress": False}
     for name, play in (("alone", None), ("play", shown)):
         folder = tmp_path / name
         with pytest.warns(UserWarning) as caught:
-            train_encoders(shown, play, folder / "weights", folder, TINY, **options)
+            train_encoders(shown, play, folder / "weights", folder, TINY, **OF_ROBOT)
         assert any("turned" in str(w.message) for w in caught) == (play is not None)
 
 
@@ -341,10 +336,9 @@ def test_a_folder_is_locked_while_encoders_are_trained_in_it(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("bgpo_trl.encoders.train.train_representation", fit)
-    robot = replace(scene(frame_shape=(32, 64), action_size=4), tasks=("left", "right", "up"))
     parts = (with_a_gripper(8), None, tmp_path / "weights", tmp_path / "fit", TINY)
     with pytest.raises(KeyboardInterrupt):
-        train_encoders(*parts, tasks=robot.tasks, scene=robot, progress=False)
+        train_encoders(*parts, **OF_ROBOT)
     assert locked == [True]
 
 
