@@ -17,7 +17,7 @@ from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.seeding import stream_seed
 from bgpo_trl.transforms import TaskSchedule
 from suites import nico
-from tests.algorithms.playing import assert_same
+from tests.algorithms.playing import assert_same, play
 from tests.helpers import DISTINCT, spied
 
 pytestmark = pytest.mark.usefixtures("easy_world")
@@ -32,7 +32,7 @@ every_kind = pytest.mark.parametrize("name", DISTINCT)
 def make(bank, encoders, make_config, in_world):
     """Make an algorithm that has played a little, and an evaluator for it."""
 
-    def make(state="latent", name="bgpo", starts=(0, 2, 4), n_steps=None, episodes=EPISODES):
+    def make(state="latent", name="bgpo", starts=(0, 2, 4), episodes=EPISODES):
         config = make_config(state, name, seeds=SEEDS)
         algorithm = entry(name).make(
             config.algorithm, seeds=SEEDS, bank=bank.seen(), encoders=encoders
@@ -40,19 +40,10 @@ def make(bank, encoders, make_config, in_world):
         in_world(algorithm, TaskSchedule(starts))
         evaluator = Evaluator(config, bank.held_out(), encoders, episodes=episodes, starts=starts)
         # Four episodes, after which all tasks are presented, take at most 24 steps.
-        n_usual = next((n for start, n in STEPS.items() if name.startswith(start)), 25)
-        train(algorithm, n_usual if n_steps is None else n_steps)
+        play(algorithm, next((n for start, n in STEPS.items() if name.startswith(start)), 25))
         return algorithm, evaluator
 
     return make
-
-
-def train(algorithm, n_steps):
-    state = algorithm.world.env.reset()
-    for _ in range(n_steps):
-        algorithm.update()
-        transition, state = algorithm.world.env.step_and_maybe_reset(algorithm.act(state))
-        algorithm.store(transition)
 
 
 def last_biases(algorithm):
@@ -189,7 +180,7 @@ def test_a_snapshot_does_not_change_with_further_training(make, name):
     with torch.no_grad():
         for bias in last_biases(algorithm):
             bias.add_(2)
-    train(algorithm, 20)
+    play(algorithm, 20)
     if nodes is not None:
         assert not algorithm.gwr.graph(0).weights.equal(nodes)
     for snapshot, policy in zip(take(evaluator, algorithm), policies, strict=True):
