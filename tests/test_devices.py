@@ -15,8 +15,9 @@ from tensordict import TensorDict
 from bgpo_trl.encoders.fitting import train_representation
 from bgpo_trl.encoders.mismatch import doubt_frames
 from bgpo_trl.encoders.representation import load_representation, save_representation
-from bgpo_trl.modules.frame_network import FRAME_NETWORKS, FrameNetwork
+from bgpo_trl.modules.frame_network import FRAME_NETWORKS
 from bgpo_trl.scenes.nico import NicoEnv
+from tests.encoders.test_frame_network import NAME, Columns
 from tests.helpers import TINY_ENCODERS, noise_demonstrations, rows
 from tests.second_device import second_device
 
@@ -81,23 +82,9 @@ def test_a_run_is_the_same_on_every_device(device, name, begin, encoders, make_c
                     assert float(ours[key]) == pytest.approx(float(theirs[key]), abs=1e-3)
 
 
-class Fields(FrameNetwork):
-    """Mean color of each of four fields, mixed by weights."""
-
-    identity = "fields 1"
-
-    def __init__(self, frame_shape):
-        super().__init__(12, frame_shape)
-        self.mix = torch.nn.Linear(12, 12)
-
-    def features(self, frames):
-        colors = frames.permute(0, 3, 1, 2).float().unflatten(2, (2, -1)).unflatten(4, (2, -1))
-        return self.mix(colors.mean((3, 5)).flatten(1)) / 255
-
-
-@pytest.mark.parametrize("frame_network", ["vae", "fields"])
+@pytest.mark.parametrize("frame_network", ["vae", NAME])
 def test_encoders_trained_elsewhere_come_back_to_the_cpu(device, tmp_path, frame_network):
-    FRAME_NETWORKS["fields"] = Fields
+    FRAME_NETWORKS[NAME] = Columns
     config = replace(TINY_ENCODERS, frame_network=frame_network)
     data, found = noise_demonstrations([3] * 4), []
     for place in ("cpu", device):

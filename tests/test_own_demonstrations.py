@@ -1,7 +1,5 @@
 """Demonstrations without actions, from arrays to a run; in a scene that has no demonstrator."""
 
-import numpy as np
-
 import bgpo_trl
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
@@ -11,29 +9,22 @@ from bgpo_trl.encoders.train import train_encoders
 from bgpo_trl.scenes import SCENES, find_scene
 from bgpo_trl.training import Trainer
 from tests.helpers import TINY_ENCODERS, finish
-from tests.scenes.dot import SavedDot, scene
-
-TASKS = ("left", "right")
+from tests.scenes.dot import TASKS, SavedDot, record_some, scene
 
 
-def filmed(n):
-    """Demonstrations of both tasks."""
-    simulation, episodes = SavedDot(), {name: [] for name in TASKS}
-    for name, direction in zip(TASKS, (-1.0, 1.0), strict=True):
-        for _ in range(n):
-            simulation.reset(name)
-            frames, success = [simulation.frame()], False
-            while not success:
-                success = simulation.step([direction * simulation.random.uniform(0.4, 0.6)]).success
-                frames.append(simulation.frame())
-            episodes[name].append({"pixels": np.stack(frames)})
+def filmed(folder):
+    """Frames of five demonstrations of each task."""
+    episodes = {name: [] for name in TASKS}
+    for row in record_some(folder, scene(SavedDot), per_task=5):
+        pixels = row["pixels"][: int(row["length"])].numpy()
+        episodes[TASKS[row["task"]]].append({"pixels": pixels})
     return episodes
 
 
 def test_demonstrations_without_actions_train_encoders_and_runs(make_config, tmp_path, refused):
     """But there is no experience of such demonstrations."""
-    SCENES["dot"] = scene(SavedDot, demonstrator=None)
-    write_demonstrations(tmp_path / "filmed", filmed(5), scene="dot", held_out_per_task=2)
+    SCENES["dot"], shown = scene(SavedDot, demonstrator=None), filmed(tmp_path / "recorded")
+    write_demonstrations(tmp_path / "filmed", shown, scene="dot", held_out_per_task=2)
     weights, options = tmp_path / "dot.safetensors", {"tasks": TASKS, "progress": False}
     parts = (load_demonstrations(tmp_path / "filmed"), None, weights, tmp_path / "fit")
     train_encoders(*parts, TINY_ENCODERS, scene="dot", **options)
@@ -51,7 +42,7 @@ def test_demonstrations_without_actions_train_encoders_and_runs(make_config, tmp
     finish(Trainer(config, run, bank=bank, encoders=encoders, progress=False))
 
     assert len((run / "train.csv").read_text().splitlines()) == 1 + 4
-    policy, frames = bgpo_trl.load_run(run), filmed(1)["right"][0]["pixels"]
+    policy, frames = bgpo_trl.load_run(run), shown["right"][0]["pixels"]
     policy.condition(frames)
     assert abs(float(policy.act(frames[0])[0])) <= 1
     parts = {"bank": bank, "encoders": encoders}
