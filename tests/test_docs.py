@@ -41,7 +41,7 @@ def commands(page):
     text = page.read_text()
     indented = re.findall(r"^    ((?:python|bgpo|make) (?:.*\\\n)*.*)$", text, re.MULTILINE)
     fenced = "\n".join(blocks(page, "bash")).replace("\\\n", " ").splitlines()
-    inline = re.findall(r"`((?:python|bgpo|make|pytest) [^`]+)`", without_blocks(page))
+    inline = re.findall(r"`((?:python|bgpo|make) [^`]+)`", without_blocks(page))
     shown = [*(block.replace("\\\n", " ") for block in indented), *fenced, *inline]
     return [shlex.join(shlex.split(line, comments=True)) for line in shown]
 
@@ -128,8 +128,6 @@ def test_commands_are_found():
 @pytest.mark.parametrize("command", OF_PYTHON)
 def test_a_command_is_understood(command, monkeypatch, parse_only):
     script, arguments = script_of(command)
-    if script == "pytest":
-        return check_pytest(arguments)
     if script.endswith(".py"):
         assert (ROOT / script).is_file()
     else:
@@ -149,16 +147,10 @@ def test_a_command_is_understood(command, monkeypatch, parse_only):
 @pytest.mark.parametrize("command", sorted({*COMMANDS} - {*OF_PYTHON}))
 def test_a_verb_or_tool_is_there(command):
     tool, *words = shlex.split(command)
-    if tool == "pytest":
-        return check_pytest(words)
     assert tool == "make"
     verbs = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
     asked = [word for word in words if "=" not in word]
     assert [verb for verb in asked if verb not in verbs] == []
-
-
-def check_pytest(words):
-    assert [word for word in words if "/" in word and not (ROOT / word).exists()] == []
 
 
 def test_readme_composes_the_environment_in_which_bgpo_is_trained():

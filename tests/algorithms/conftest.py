@@ -13,17 +13,8 @@ from tests.algorithms.playing import CHANGES, SCHEDULE, VARIANTS
 def make_bgpo(bank, encoders, make_config, in_world):
     """Makes BGPO; its groups have seen the first ``known`` demonstrations, from each seed's on."""
 
-    def make(
-        variant="latent, b",
-        seeds=(3, 8),
-        schedule=SCHEDULE,
-        bank=bank,
-        config=None,
-        known=0,
-        **changes,
-    ):
+    def make(variant="latent, b", seeds=(3, 8), schedule=SCHEDULE, bank=bank, known=0, **changes):
         state, _, name = VARIANTS[variant]
-        changes = {**({} if config is None else {"rl": config}), **changes}
         config = make_config(state, name).algorithm
         config = replace(config, **{**CHANGES.get(variant, {}), **changes})
         bank = bank.for_tasks(bank.tasks[: schedule.n_tasks])

@@ -47,7 +47,7 @@ def test_joined_groups_have_one_expert_and_one_replay(make_bgpo, bank):
 def test_who_plays_is_decided_at_reset_and_acts_until_the_end(make_bgpo, bank):
     """Another expert than the group's in each episode; actions are those of its networks."""
     quiet = replace(make_bgpo("clone").config.rl, noise=0.0, averaging=0.0)
-    algorithm = make_bgpo("clone", known=15, config=quiet)
+    algorithm = make_bgpo("clone", known=15, rl=quiet)
     began, ended, played = [], [], []
     for seed, groups in enumerate(algorithm.groups):
 
