@@ -50,13 +50,6 @@ def made(folder):
     )
 
 
-@pytest.fixture
-def copy(made, folder, tmp_path):
-    """A copy of the files, which a test may change."""
-    shutil.copytree(folder / "encoders", tmp_path, dirs_exist_ok=True)
-    return tmp_path / "some.safetensors"
-
-
 def test_made_encoders_and_bank_are_loaded(made, folder):
     encoders, bank = made
     loaded_encoders, loaded_bank = load_pretrained(folder / "encoders" / "some.safetensors")
@@ -102,7 +95,8 @@ def test_the_same_command_records_and_trains_nothing_again(made, folder, monkeyp
         make(per_task=4)
 
 
-def test_files_that_do_not_belong_together_are_refused(made, copy, monkeypatch):
+def test_files_that_do_not_belong_together_are_refused(made, folder, tmp_path, monkeypatch):
+    copy = Path(shutil.copytree(folder / "encoders", tmp_path / "copy")) / "some.safetensors"
     with monkeypatch.context() as patch:
         patch.setitem(SCENES, "nico", replace(NICO, version="another"))
         with pytest.raises(

@@ -89,11 +89,6 @@ def dataset() -> TensorDict:
     return squares(120)
 
 
-@pytest.fixture(scope="module")
-def trained(dataset: TensorDict) -> Representation:
-    return train(dataset, CONFIG)
-
-
 def train(dataset: TensorDict, config: RepresentationConfig = TINY, **options) -> Representation:
     options = {"scene": "squares 1", "progress": False, **options}
     return train_representation(dataset, config, **options)
@@ -136,11 +131,9 @@ def test_encoders_as_published_have_constant_rates_no_keypoints_and_no_inverse_m
     assert latent.equal(made.frame_network.latent(squares(8)["pixels"][:, 0]))
 
 
-def test_encoders_capture_frames_places_actions_and_tasks(
-    trained: Representation, dataset: TensorDict
-) -> None:
+def test_encoders_capture_frames_places_actions_and_tasks(dataset: TensorDict) -> None:
     """Held-out errors of the probes, against guessing the mean of the training set."""
-    probed = probe(trained, dataset, columns=NICO.state)
+    probed = probe(train(dataset, CONFIG), dataset, columns=NICO.state)
     assert probed["reconstruction"] < 0.6 * probed["mean_frame_reconstruction"]
     positions = [
         part["state"][torch.arange(51) < part["length"].unsqueeze(-1)] for part in split(dataset)

@@ -155,12 +155,6 @@ def test_decoder_is_fed_phi_at_every_step(lae: SequenceAutoencoder) -> None:
 # ---- the inverse model
 
 
-@pytest.fixture
-def model() -> InverseModel:
-    torch.manual_seed(0)
-    return InverseModel(3, 2, hidden_size=8)
-
-
 def test_a_window_holds_the_latents_around_a_step_within_the_episode() -> None:
     """Plain reference: lists; before the first and after the last latent, that one repeats."""
     generator = torch.Generator().manual_seed(0)
@@ -173,7 +167,9 @@ def test_a_window_holds_the_latents_around_a_step_within_the_episode() -> None:
         assert found.tolist() == expected
 
 
-def test_the_actions_of_an_episode_are_those_of_its_windows(model: InverseModel) -> None:
+def test_the_actions_of_an_episode_are_those_of_its_windows() -> None:
+    torch.manual_seed(0)
+    model = InverseModel(3, 2, hidden_size=8)
     generator = torch.Generator().manual_seed(0)
     z, length = torch.randn(2, 5, 3, generator=generator), torch.tensor([5, 3])
     action = model(z, length)
