@@ -1,6 +1,5 @@
 """Dist-NLL: who learns from what and when."""
 
-import math
 from copy import deepcopy
 from dataclasses import replace
 
@@ -35,13 +34,6 @@ def make(make_task_algorithm):
     return lambda name="dist-nll", **changes: make_task_algorithm(name, **changes)
 
 
-def teachers_action(algorithm, seed, task, state):
-    """Actions of a teacher, computed from its weights."""
-    return perceptron(
-        weights_of(algorithm.learner.loss.actor_network_params, seed, task), state
-    ).tanh()
-
-
 def test_teachers_learn_from_demonstrations_too_and_students_do_not(make, bank):
     """All frames of demonstrations are turned round in one of two runs."""
     steps = bank.seen().steps
@@ -60,11 +52,6 @@ def test_teachers_learn_from_demonstrations_too_and_students_do_not(make, bank):
     sampled = first.replay.sample(torch.zeros(1, 200, dtype=torch.int64), seeds=[0])["latent"]
     frames = steps.latents(torch.arange(len(steps.latent)))
     assert not (sampled.view(-1, 1, 64) == frames).all(-1).any()
-
-
-def plain_nll(loc, scale, action):
-    nll = scale.log() + 0.5 * math.log(2 * math.pi) + (action - loc).square() / (2 * scale**2)
-    return nll.sum(-1).mean(-1).sum()
 
 
 @pytest.mark.parametrize("schedule", [SCHEDULE, OTHER_SCHEDULE])
@@ -95,13 +82,15 @@ def test_students_learn_from_their_teachers_at_the_end_of_each_episode(make, sch
                 head = student.add_head(heads[index])
                 optimizer.add_param_group({"params": list(head.parameters())})
         states = draw(index, order, 24)
+        teachers = algorithm.learner.loss.actor_network_params
         actions = [
-            teachers_action(algorithm, index, task, of_task)
+            perceptron(weights_of(teachers, index, task), of_task).tanh()
             for task, of_task in zip(order, states, strict=True)
         ]
         for half in (slice(0, 12), slice(12, 24)):
             told = student(TensorDict({"state": states[:, half]}, [len(order), 12]))
-            loss = plain_nll(told["loc"], told["scale"], torch.stack(actions)[:, half])
+            policy = torch.distributions.Normal(told["loc"], told["scale"])
+            loss = -policy.log_prob(torch.stack(actions)[:, half]).sum(-1).mean(-1).sum()
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
