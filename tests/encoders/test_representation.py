@@ -6,6 +6,7 @@ import warnings
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -335,22 +336,14 @@ def test_a_folder_is_locked_while_encoders_are_trained_in_it(
     assert locked == [True]
 
 
-class Halving:
-    """A frame encoder that reconstructs half of the deviation from the mean frame."""
-
-    def __init__(self, mean: torch.Tensor) -> None:
-        self.mean = mean
-
-    def encode(self, frames: torch.Tensor) -> tuple[torch.Tensor]:
-        return (frames / 255 - self.mean,)
-
-    def decode(self, deviation: torch.Tensor) -> torch.Tensor:
-        return self.mean + deviation / 2
-
-
 def test_what_moves_is_measured_apart_from_what_stands_still(dataset: TensorDict) -> None:
+    """By a frame encoder that reconstructs half of the deviation from the mean frame."""
     parts = split(dataset)
-    found = _probe_reconstruction(Halving(mean_frame(valid_frames(parts[0]))), *parts)
+    mean = mean_frame(valid_frames(parts[0]))
+    halving: Any = SimpleNamespace(
+        encode=lambda frames: (frames / 255 - mean,), decode=lambda deviation: mean + deviation / 2
+    )
+    found = _probe_reconstruction(halving, *parts)
     assert found["moving_reconstruction"] == pytest.approx(0.75)
     share = found["reconstruction"] / found["mean_frame_reconstruction"]
     assert share == pytest.approx(0.25)

@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -87,20 +88,12 @@ def run_of(finished_runs, shipped, tmp_path):
     return lambda name: shutil.copytree(finished_runs(name), tmp_path / "runs" / name)
 
 
-class Scripted:
-    """Algorithm that has only a policy, a function of the ground truth."""
-
-    device = torch.device("cpu")
-
-    def __init__(self, act):
-        center, scale = torch.tensor(STATE_CENTER), torch.tensor(STATE_SCALE)
-        self._actor = TensorDictModule(
-            lambda state: act(state * scale + center), in_keys=["state"], out_keys=["action"]
-        )
-
-    def snapshot(self, index, embedding, task, generator):
-        del index, embedding, task, generator
-        return Policy(self._actor, "state", {})
+def scripted(act):
+    """An algorithm that has only a policy, a function of the ground truth."""
+    center, scale = torch.tensor(STATE_CENTER), torch.tensor(STATE_SCALE)
+    actor = TensorDictModule(lambda state: act(state * scale + center), ["state"], ["action"])
+    policy = Policy(actor, "state", {})
+    return SimpleNamespace(device=torch.device("cpu"), snapshot=lambda *_: policy)
 
 
 @pytest.fixture
@@ -112,6 +105,6 @@ def scripted_run(make_config):
         config = make_config("state", "oracle", tasks=(name,), task_starts=(0,))
         none_seen = torch.zeros(4, dtype=torch.bool)
         held_out = DemonstrationBank(torch.zeros(4, 32), torch.zeros(4).long(), none_seen, (name,))
-        return LoadedRun(config, Scripted(act), None, held_out, [0])
+        return LoadedRun(config, scripted(act), None, held_out, [0])
 
     return make

@@ -5,18 +5,11 @@ import pytest
 from bgpo_trl.files.progress import progress_bar
 
 
-class Stream(io.StringIO):
-    terminal = True
-
-    def isatty(self):
-        return self.terminal
-
-
 @pytest.mark.parametrize(("terminal", "drawn"), [(True, range(95, 110)), (False, range(3, 9))])
 def test_a_bar_is_redrawn_more_often_on_a_terminal_than_in_a_log(monkeypatch, terminal, drawn):
     """A hundred seconds, an update in each."""
-    stream, seconds = Stream(), [0.0]
-    stream.terminal = terminal
+    stream, seconds = io.StringIO(), [0.0]
+    monkeypatch.setattr(stream, "isatty", lambda: terminal)
     monkeypatch.setattr("sys.stderr", stream)
     monkeypatch.setattr("tqdm.std.time", lambda: seconds[0])
     with progress_bar("train", total=100, unit="episode") as bar:

@@ -1,12 +1,14 @@
 """Losses of the encoders against numbers by hand, and the noise, padding and gradients."""
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from tensordict.nn import TensorDictModule
+from torch import Tensor
 
 from bgpo_trl.configs import VAEConfig
 from bgpo_trl.modules.inverse_model import InverseModel
@@ -19,22 +21,14 @@ from bgpo_trl.objectives.supervised import (
 )
 
 
-class HandVAE(nn.Module):
+def hand_vae(mu: Tensor, log_variance: Tensor, grey: float = 0.0) -> Any:
     """Two latents with known posterior; decodes to a constant; the action is ``z_next - z``."""
-
-    def __init__(self, mu: Tensor, log_variance: Tensor, grey: float = 0.0) -> None:
-        super().__init__()
-        self.mu, self.log_variance, self.grey = mu, log_variance, grey
-        self.mean_frame = torch.zeros(32, 64, 3)
-
-    def encode(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        return self.mu, self.log_variance
-
-    def decode(self, z: Tensor) -> Tensor:
-        return torch.full((*z.shape[:-1], 32, 64, 3), self.grey)
-
-    def inverse(self, z: Tensor, z_next: Tensor) -> Tensor:
-        return z_next - z
+    return SimpleNamespace(
+        mean_frame=torch.zeros(32, 64, 3),
+        encode=lambda pixels: (mu, log_variance),
+        decode=lambda z: torch.full((*z.shape[:-1], 32, 64, 3), grey),
+        inverse=lambda z, z_next: z_next - z,
+    )
 
 
 def windows(n: int = 2, k: int = 3, n_actions: int = 4) -> TensorDict:
@@ -51,7 +45,7 @@ def test_hand_computed_numbers() -> None:
     data["pixels"] = torch.full_like(data["pixels"], 51)  # 0.2
     data["action"] = torch.tensor([[[0.0, 1.0], [2.0, 1.0], [torch.nan, torch.nan]]])
     result = vae_inverse_loss(
-        HandVAE(mu, log_variance, grey=0.3),  # type: ignore[arg-type]
+        hand_vae(mu, log_variance, grey=0.3),
         data,
         VAEConfig(
             reconstruction_weight=2.0, foreground_weight=0.0, kl_weight=0.5, inverse_weight=3.0
@@ -68,13 +62,13 @@ def test_hand_computed_numbers() -> None:
 
 
 def test_pixels_that_differ_from_the_mean_frame_weigh_more() -> None:
-    vae = HandVAE(torch.zeros(1, 3, 2), torch.zeros(1, 3, 2), grey=0.3)
+    vae = hand_vae(torch.zeros(1, 3, 2), torch.zeros(1, 3, 2), grey=0.3)
     data = windows(1, 3, 2)
     data["pixels"] = torch.full_like(data["pixels"], 51)  # 0.2
     vae.mean_frame = torch.full((32, 64, 3), 0.2)
     vae.mean_frame[3, 5] = torch.tensor([0.2, 0.5, 0.1])
     vae.mean_frame[8, 9] = 0.25
-    result = vae_inverse_loss(vae, data, VAEConfig(foreground_weight=7.0))  # type: ignore[arg-type]
+    result = vae_inverse_loss(vae, data, VAEConfig(foreground_weight=7.0))
     assert result["reconstruction"].item() == pytest.approx(6144 * 0.1**2, rel=1e-4)
     counted = (6144 + 7 * 3 * (0.3 + 0.05)) * 0.1**2
     assert result["loss_reconstruction"].item() == pytest.approx(counted, rel=1e-4)
@@ -84,29 +78,29 @@ def test_latents_are_sampled_with_the_posteriors_standard_deviation() -> None:
     """With actions zero the inverse loss is half the variance of z_next - z: sigma^2 a number."""
     mu, log_variance = torch.zeros(4, 3, 1000), torch.full((4, 3, 1000), 2 * math.log(0.3))
     generator = torch.Generator().manual_seed(0)
-    vae = HandVAE(mu, log_variance)
+    vae = hand_vae(mu, log_variance)
     data = windows(4, 3, 1000)
     data["action"].zero_()
-    loss = vae_inverse_loss(vae, data, VAEConfig(), generator=generator)  # type: ignore[arg-type]
+    loss = vae_inverse_loss(vae, data, VAEConfig(), generator=generator)
     assert loss["inverse"].item() == pytest.approx(1000 * 0.3**2, rel=0.05)
 
 
 def test_only_known_actions_train_the_inverse_model() -> None:
     """Zeros in and out: the loss is half the squared norm of the known actions, on average."""
     mu = torch.zeros(3, 3, 4)
-    vae = HandVAE(mu, torch.full((3, 3, 4), -100.0))
+    vae = hand_vae(mu, torch.full((3, 3, 4), -100.0))
     known = torch.tensor([True, False, True])
     data = TensorDict({**windows(3), "action_known": known}, [3])
     expected = data["action"][[0, 2], :2].square().sum(-1).mean() / 2
-    loss = vae_inverse_loss(vae, data, VAEConfig())  # type: ignore[arg-type]
+    loss = vae_inverse_loss(vae, data, VAEConfig())
     assert loss["inverse"] == pytest.approx(expected.item())
     data["action"][1] = torch.nan  # whatever stands for an unknown action
-    assert vae_inverse_loss(vae, data, VAEConfig())["inverse"] == loss["inverse"]  # type: ignore[arg-type]
+    assert vae_inverse_loss(vae, data, VAEConfig())["inverse"] == loss["inverse"]
     with pytest.raises(ValueError, match=r"action_known must be \[3\], got \[3, 1\]"):
         wrong = data.clone().set("action_known", known.unsqueeze(-1))
-        vae_inverse_loss(vae, wrong, VAEConfig())  # type: ignore[arg-type]
+        vae_inverse_loss(vae, wrong, VAEConfig())
     data["action_known"][:] = False
-    assert vae_inverse_loss(vae, data, VAEConfig())["inverse"] == 0  # type: ignore[arg-type]
+    assert vae_inverse_loss(vae, data, VAEConfig())["inverse"] == 0
 
 
 def test_action_inference_loss_is_the_squared_error() -> None:
@@ -118,18 +112,12 @@ def test_action_inference_loss_is_the_squared_error() -> None:
     assert loss.item() == pytest.approx(error.square().sum().item() / 5)
 
 
-class GivenReconstruction(nn.Module):
-    """Reconstructs given latents, whatever the code."""
-
-    def __init__(self, reversed_latent: Tensor) -> None:
-        super().__init__()
-        self.reversed_latent = reversed_latent
-
-    def encode(self, z: Tensor, length: Tensor) -> Tensor:
-        return z[..., 0, :]
-
-    def decode(self, phi: Tensor, n_steps: int) -> Tensor:
-        return self.reversed_latent[..., :n_steps, :]
+def given(reconstruction: Tensor) -> Any:
+    """Reconstructs given latents, in reverse order, whatever the code."""
+    return SimpleNamespace(
+        encode=lambda z, length: z[..., 0, :],
+        decode=lambda phi, n_steps: reconstruction[..., :n_steps, :],
+    )
 
 
 def test_sequence_loss_by_hand() -> None:
@@ -137,13 +125,13 @@ def test_sequence_loss_by_hand() -> None:
     data = TensorDict({"latent": latent, "length": torch.tensor([2, 1])}, [2])
     backwards = torch.tensor([[[3.0, 4.0], [1.0, 2.0]], [[5.0, 6.0], [-7.0, 7.0]]])
     key = "loss_reconstruction"
-    assert sequence_reconstruction_loss(GivenReconstruction(backwards), data)[key] == 0  # type: ignore[arg-type]
+    assert sequence_reconstruction_loss(given(backwards), data)[key] == 0
     backwards[0, 1] += torch.tensor([3.0, 0.0])
     backwards[1, 0] += torch.tensor([0.0, 1.0])
     # Squares 9 and 1 over three valid steps of two numbers.
-    loss = sequence_reconstruction_loss(GivenReconstruction(backwards), data)  # type: ignore[arg-type]
+    loss = sequence_reconstruction_loss(given(backwards), data)
     assert loss[key].item() == pytest.approx(10 / 6)
-    loss = sequence_reconstruction_loss(GivenReconstruction(backwards[:1]), data[:1])  # type: ignore[arg-type]
+    loss = sequence_reconstruction_loss(given(backwards[:1]), data[:1])
     assert loss[key].item() == pytest.approx(9 / 4)
 
 
@@ -170,16 +158,8 @@ SCALE = [[[0.1, 0.2], [1.0, 0.5], [0.3, 0.3]], [[0.25, 1.0], [0.4, 0.1], [0.15, 
 ACTION = [[[0.2, 0.5], [0.25, 0.0], [-0.4, 0.8]], [[0.0, 1.0], [0.7, -0.4], [-1.0, -0.6]]]
 
 
-class Given(TensorDictModuleBase):
-    """A policy whose states are the parameters of its distributions."""
-
-    def __init__(self):
-        super().__init__()
-        self.in_keys, self.out_keys = ["parameters"], ["loc", "scale"]
-
-    def forward(self, tensordict):
-        loc, scale = tensordict["parameters"].unbind(-1)
-        return tensordict.set("loc", loc).set("scale", scale)
+# A policy whose states are the parameters of its distributions.
+POLICY = TensorDictModule(lambda given: given.unbind(-1), ["parameters"], ["loc", "scale"])
 
 
 def given_batch():
@@ -195,7 +175,7 @@ def test_the_loss_is_the_negative_log_likelihood_of_the_teachers_actions():
     batch = given_batch()
     mean, scale, action = (torch.tensor(values) for values in (MEAN, SCALE, ACTION))
     nll = 0.5 * (2 * math.pi * scale**2).log() + (action - mean) ** 2 / (2 * scale**2)
-    loss = distillation_loss(Given(), batch)
+    loss = distillation_loss(POLICY, batch)
     torch.testing.assert_close(loss, nll.sum() / 3)  # a mean over the states, a sum over the rest
     assert set(batch.keys()) == {"parameters", "teacher_action"}
     loss.backward()
@@ -207,10 +187,10 @@ def test_the_loss_is_the_negative_log_likelihood_of_the_teachers_actions():
 
 def test_weights_are_factors_of_the_losses_of_states():
     batch = given_batch()
-    whole = distillation_loss(Given(), batch)
+    whole = distillation_loss(POLICY, batch)
     weights = torch.tensor([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
-    first = distillation_loss(Given(), batch.set("priority_weight", weights))
-    second = distillation_loss(Given(), batch.set("priority_weight", 1 - weights))
+    first = distillation_loss(POLICY, batch.set("priority_weight", weights))
+    second = distillation_loss(POLICY, batch.set("priority_weight", 1 - weights))
     torch.testing.assert_close(first + second, whole)
     first.backward()
     assert (batch["parameters"].grad[0] != 0).any() and (batch["parameters"].grad[1] == 0).all()
@@ -221,4 +201,4 @@ def test_entries_that_would_broadcast_are_refused():
         batch = given_batch()
         batch[entry] = torch.ones(2, 3, 1)
         with pytest.raises(ValueError, match=entry):
-            distillation_loss(Given(), batch)
+            distillation_loss(POLICY, batch)
