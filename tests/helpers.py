@@ -248,13 +248,7 @@ class FilmStandIn(ModuleType):
 
 
 class Recorder(Logger):
-    """Logger that keeps what it gets, in place of a service.
-
-    Attributes:
-        metrics: Pairs of metrics and step.
-        settings: Hyperparameters.
-        closed: Whether it was shut down.
-    """
+    """Logger that keeps metrics with their steps, and settings, in place of a service."""
 
     def __init__(self):
         super().__init__("run", "")

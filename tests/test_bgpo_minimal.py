@@ -10,7 +10,6 @@ import torch
 
 from bgpo_trl.algorithms import entry
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.training import Trainer
 from tests.helpers import spied
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "bgpo_minimal.py"
@@ -64,7 +63,7 @@ def minimal(example, small, encoders, bank):
 
 
 @pytest.fixture(scope="module")
-def library(small, encoders, bank, tmp_path_factory):
+def library(small, begin, tmp_path_factory):
     """A run of `bgpo-single` with the same settings, and its transitions and evaluations."""
     defaults = entry("bgpo-single").config
     config = replace(
@@ -83,8 +82,7 @@ def library(small, encoders, bank, tmp_path_factory):
         name="bgpo-single",
         algorithm=config,
     )
-    directory = tmp_path_factory.mktemp("library")
-    with Trainer(run, directory, bank=bank, encoders=encoders, progress=False) as trainer:
+    with begin(tmp_path_factory.mktemp("library"), run) as trainer:
         stored, tested = spied(trainer.algorithm, "store"), spied(trainer.evaluator, "run")
         trainer.run()
     return trainer.algorithm, stored, tested

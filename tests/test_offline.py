@@ -5,8 +5,8 @@ import torch
 from tensordict import TensorDict
 
 from bgpo_trl.algorithms import entry
-from bgpo_trl.training import Trainer
 from tests.algorithms.playing import assert_same
+from tests.helpers import interrupt_call
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 N = 7  # odd, since the actor learns in every other update
@@ -27,21 +27,17 @@ def offline_config(make_config):
 def first_save(begin):
     """Play until the first checkpoint; return the algorithm."""
 
-    def play(directory, config) -> Trainer:
+    def play(directory, config):
         trainer = begin(directory, config)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(trainer, "_act", lambda state: 1 / 0)
-            with pytest.raises(ZeroDivisionError):
-                trainer.run()
-        trainer.close()
-        return trainer
+        interrupt_call(trainer, trainer, "_act", 1)
+        return trainer.algorithm
 
     return play
 
 
 def test_updates_are_those_made_by_hand(first_save, offline_config, bank, encoders, tmp_path):
     config = offline_config()
-    ours = first_save(tmp_path, config).algorithm
+    ours = first_save(tmp_path, config)
     by_hand = entry("bgpo").make(
         config.algorithm, seeds=config.seeds, bank=bank.seen(), encoders=encoders
     )
@@ -83,8 +79,8 @@ def test_updates_are_those_made_by_hand(first_save, offline_config, bank, encode
 def test_seeds_learn_alone_what_they_learn_beside_others(
     first_save, offline_config, tmp_path, name
 ):
-    both = first_save(tmp_path / "both", offline_config(name)).algorithm
-    alone = first_save(tmp_path / "alone", offline_config(name, seeds=(8,))).algorithm
+    both = first_save(tmp_path / "both", offline_config(name))
+    alone = first_save(tmp_path / "alone", offline_config(name, seeds=(8,)))
     fresh = entry(name).make(alone.config, seeds=(8,), bank=alone.bank, encoders=alone.encoders)
     for group in both.groups[1].numbers if both.groups else [0]:
         ours, theirs = both.actor_weights(1, group), alone.actor_weights(0, group)

@@ -20,7 +20,6 @@ from bgpo_trl.encoders.representation import save_representation
 from bgpo_trl.policy import LoadedRun
 from bgpo_trl.runs.config_file import settings_of
 from bgpo_trl.scenes.nico import NICO
-from bgpo_trl.training import Trainer
 from suites import nico
 from tests.helpers import edit, finish
 
@@ -62,7 +61,7 @@ def tested_bank(encoders, bank):
 
 
 @pytest.fixture(scope="module")
-def trainer_of(encoders, tested_bank, make_config, easy_world, tmp_path_factory):
+def trainer_of(encoders, tested_bank, begin, make_config, easy_world, tmp_path_factory):
     """Play a run of each algorithm, with encoders in its directory, once."""
     trainers = {}
 
@@ -74,8 +73,7 @@ def trainer_of(encoders, tested_bank, make_config, easy_world, tmp_path_factory)
             weights = directory / "encoders" / "encoders.safetensors"
             save_representation(encoders, weights)
             replace(tested_bank, encoder_id=encoders.identity).save(bank_path(weights))
-            parts = {"bank": tested_bank, "encoders": encoders, "progress": False}
-            trainers[name] = Trainer(config, directory, **parts)
+            trainers[name] = begin(directory, config, bank=tested_bank)
             trainers[name].run()
         return trainers[name]
 

@@ -21,12 +21,7 @@ def kill_again_and_again(target, arguments, progress, times):
 
     Each process is killed a random moment after some progress, so as late on a slow machine as on a
     fast one. Processes are forks of one that has imported everything and has no window to the GPU.
-
-    Args:
-        target: Begins or continues something.
-        arguments: Its arguments.
-        progress: Returns a number that grows with its progress.
-        times: How often it is killed.
+    `progress` returns a number that grows.
     """
     rng = np.random.default_rng(0)
     context = multiprocessing.get_context("forkserver")

@@ -93,10 +93,7 @@ def pretrain(robot, folder, per_task=6):
 def run_config(name="bgpo", algorithm=None, **changes):
     """Return the settings of a run of four episodes, with some of them and the algorithm's changed.
 
-    Args:
-        name: Of the algorithm.
-        algorithm: Changes of its settings, those of its networks and updates under ``rl``.
-        **changes: Changes of the run's settings.
+    Those of the algorithm's networks and updates are under ``rl``.
     """
     usual, given = ALGORITHMS[name].config, {"max_steps": 12, **(algorithm or {})}
     rl = replace(usual.rl, **{"warmup_steps": given["max_steps"], **given.pop("rl", {})})
