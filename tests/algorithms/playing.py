@@ -62,18 +62,6 @@ def play(algorithm, n_steps, state=None, hidden=(), watch=lambda chosen: None, b
     return torch.stack(transitions, dim=1), state
 
 
-def spy_batches(algorithm):
-    """The batches that an algorithm learns from, as they come."""
-    batches, learn = [], algorithm.learn
-
-    def spy(batch):
-        batches.append(batch.clone())
-        return learn(batch)
-
-    algorithm.learn = spy
-    return batches
-
-
 def snapshot(algorithm, index, embedding=0.0, seed=0):
     """The policy of a seed for two test episodes of each task, all shown the same embedding."""
     shape = (algorithm.n_tasks, 2)

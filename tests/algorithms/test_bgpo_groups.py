@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from bgpo_trl.transforms import TaskSchedule
-from tests.algorithms.playing import assert_same, perceptron, play, spy_batches
+from tests.algorithms.playing import assert_same, perceptron, play
+from tests.helpers import spied
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 
@@ -108,13 +109,12 @@ def test_trials_of_experts_are_played_as_such(make_bgpo):
 @pytest.mark.parametrize("variant", ["group-balanced replay", "all"])
 def test_an_update_sees_as_much_of_each_group_played_last(make_bgpo, bank, variant):
     algorithm = make_bgpo(variant, schedule=TaskSchedule((0, 0, 0)), known=15)
-    batches = spy_batches(algorithm)
-    actives = []
+    learned, actives = spied(algorithm, "learn"), []
     data, _ = play(algorithm, 50, watch=lambda _: actives.append(algorithm.active.group))
     frames = bank.seen().steps.latents(torch.arange(len(bank.seen().steps.latent)))
     n_experts, n_shown = (2, 2) if variant == "all" else (1, 0)
     n_full = 0
-    for step, batch in enumerate(batches, 50 - len(batches)):
+    for step, ((batch,), _) in enumerate(learned, 50 - len(learned)):
         assert batch.shape == (2, n_experts, 16 // n_experts)
         for seed in range(2):
             groups, past = actives[step][seed].tolist(), data["group"][seed, :step]
@@ -145,12 +145,12 @@ def test_own_successes_of_the_group_are_a_share_of_what_is_imitated(make_bgpo, b
     """Where a group has none yet, all is demonstrated."""
     rl = replace(make_bgpo("all").config.rl, success_share=0.25)
     algorithm = make_bgpo("all", schedule=TaskSchedule((0, 0, 0)), known=15, rl=rl)
-    batches, actives = spy_batches(algorithm), []
+    learned, actives = spied(algorithm, "learn"), []
     data, _ = play(algorithm, 60, watch=lambda _: actives.append(algorithm.active.group))
     frames = bank.seen().steps.latents(torch.arange(len(bank.seen().steps.latent)))
     episode = data["next", "done"].squeeze(-1).cumsum(1) - data["next", "done"].squeeze(-1).int()
     n_own, n_lacking = 0, 0
-    for step, batch in enumerate(batches, 60 - len(batches)):
+    for step, ((batch,), _) in enumerate(learned, 60 - len(learned)):
         for seed in range(2):
             won = episode[seed, :step][data["next", "success"][seed, :step, 0]]
             succeeded = torch.isin(episode[seed, :step], won)

@@ -18,7 +18,6 @@ from tests.algorithms.playing import (
     perceptron,
     play,
     snapshot,
-    spy_batches,
     weights_of,
 )
 from tests.helpers import spied
@@ -40,10 +39,10 @@ def test_teachers_learn_from_demonstrations_too_and_students_do_not(make, bank):
     other = replace(bank, steps=replace(bank.steps, latent=-bank.steps.latent))
     options = {"state": "latent", "name": "dist-nll-demonstrations"}
     first, second = make(**options), make(bank=other, **options)
-    spied = [spy_batches(algorithm) for algorithm in (first, second)]
+    learned = [spied(algorithm, "learn") for algorithm in (first, second)]
     for algorithm in (first, second):
         play(algorithm, 30)
-    batches = [batch[0] for batch in spied]  # before anything could come of it
+    batches = [calls[0][0][0] for calls in learned]  # before anything could come of it
     ready = batches[0]["priority_weight"][..., 0] > 0
     assert ready.any()
     ours, theirs = (batch["latent"][ready] for batch in batches)

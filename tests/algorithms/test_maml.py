@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from bgpo_trl.transforms import TaskSchedule
-from tests.algorithms.playing import play, snapshot, spy_batches
+from tests.algorithms.playing import play, snapshot
 from tests.helpers import spied
 
 pytestmark = pytest.mark.usefixtures("easy_world")
@@ -52,13 +52,13 @@ def test_each_half_of_a_tasks_batch_has_its_share_of_demonstrations(make_task_al
     """One half is to adapt to, the other to judge the adapted policy by."""
     algorithm = make_task_algorithm("maml-demonstrations", state="latent", task_batch_size=8)
     assert algorithm.config.demonstration_share == 0.25
-    batches = spy_batches(algorithm)
+    learned = spied(algorithm, "learn")
     data, _ = play(algorithm, 45)
     steps = bank.seen().steps
     frames = steps.latents(torch.arange(len(steps.latent)))
     of_frame = torch.repeat_interleave(bank.seen().task, steps.length)
     n_batches = 0
-    for batch in batches:
+    for (batch,), _ in learned:
         assert batch.shape == (2, N_TASKS, 8)
         for seed, task in batch["priority_weight"].all(-1).nonzero().tolist():
             latents = batch["latent"][seed, task].unsqueeze(1)

@@ -8,7 +8,8 @@ import torch
 
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import TaskSchedule
-from tests.algorithms.playing import assert_same, perceptron, play, spy_batches, weights_of
+from tests.algorithms.playing import assert_same, perceptron, play, weights_of
+from tests.helpers import spied
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 SEEDS = (4, 6)
@@ -57,9 +58,9 @@ def test_tasks_can_share_a_batch_in_equal_parts(make_task_algorithm, name):
     """By hand: 24 transitions are 24 of one task, 12 of each of two, 8 of each of three."""
     schedule = TaskSchedule((0, 3, 6))
     algorithm = make_task_algorithm(name, schedule=schedule, task_batch_size=24, share_batch=True)
-    batches, found = spy_batches(algorithm), set()
+    learned, found = spied(algorithm, "learn"), set()
     data, _ = play(algorithm, 150)
-    for batch in batches:
+    for (batch,), _ in learned:
         n_rows = batch.shape[-1]
         for index in range(2):
             counts = (batch["priority_weight"][index] > 0).sum(-1).tolist()

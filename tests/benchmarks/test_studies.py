@@ -15,7 +15,7 @@ from bgpo_trl.modules.actor_critic import Actor, Critic, ProposalPolicy
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.policy import load_all_seeds
-from tests.helpers import finish
+from tests.helpers import finish, spied
 
 
 @pytest.mark.usefixtures("easy_world")
@@ -59,15 +59,9 @@ def test_before_training_a_clone_is_tested_by_what_it_has_imitated(monkeypatch):
     monkeypatch.setattr(one_task, "N_IMITATION", 3)
     trial = one_task.Trial(one_task.Arguments(demonstrations=5, tests=1))
     trial.imitate()
-    act, acted = trial.act, []
-
-    def noted(latent, *arguments, **options):
-        acted.append((latent.clone(), act(latent, *arguments, **options)))
-        return acted[-1][1]
-
-    monkeypatch.setattr(trial, "act", noted)
+    acted = spied(trial, "act")
     trial.report(0, alone=True)
-    latent, action = acted[0]
+    (latent, *_), action = acted[0]
     state = TensorDict({"latent": latent[None, None]}, [1, 1, 1])
     imitated = trial.learner.loss.call_network("clone_network", state)["action"]
     torch.testing.assert_close(action, imitated[0, 0])

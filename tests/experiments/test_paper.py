@@ -30,7 +30,7 @@ from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.demonstrations import own_weights
 from bgpo_trl.runs.results import read_run, read_table
 from suites import nico
-from tests.helpers import Recorder, cells, contents, edit, rows
+from tests.helpers import Recorder, cells, contents, edit, rows, spied
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -336,16 +336,9 @@ def test_a_policy_of_the_ground_truth_needs_no_frames(tiniest, tmp_path):
 
 
 def test_seen_tests_show_only_demonstrations_of_training(tiniest, tmp_path, monkeypatch):
-    run, shown = tmp_path / "run", []
-
-    class Recording(measure.Evaluator):
-        def __init__(self, config, bank, *rest, **options):
-            shown.append(bank)
-            super().__init__(config, bank, *rest, **options)
-
-    monkeypatch.setattr(measure, "Evaluator", Recording)
-    continual(Arguments(out=run, settings=("--demonstrations", "1")))
-    seen, held_out, *_ = shown
+    made = spied(measure, "Evaluator", monkeypatch)
+    continual(Arguments(out=tmp_path / "run", settings=("--demonstrations", "1")))
+    seen, held_out, *_ = (bank for (_, bank, *_), _ in made)
     assert seen.task.tolist() == [0, 1, 2]  # one demonstration of each task
     assert len(held_out.task) > 3
 

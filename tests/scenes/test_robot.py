@@ -11,7 +11,7 @@ from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
 from bgpo_trl.runs.results import read_table
 from bgpo_trl.scenes import SCENES, Outcome, RobotEnv, SimulationEnv
 from bgpo_trl.scenes.check import check_scene
-from tests.helpers import finish
+from tests.helpers import finish, spied
 from tests.scenes.dot import (
     SHAPE,
     TASKS,
@@ -95,21 +95,15 @@ def test_recordings_hold_the_executed_actions(tmp_path):
 def test_a_run_without_tests_learns_from_what_was_executed(tmp_path, monkeypatch):
     robot = robot_scene()
     monkeypatch.setitem(SCENES, "dot", robot)
-    pretrained, asked = pretrain(robot, tmp_path), []
+    pretrained = pretrain(robot, tmp_path)
     config = run_config(seeds=(3,), eval_episodes=0)
     with trainer_of(tmp_path / "run", pretrained, config) as trainer:
-        act = trainer.algorithm.act
-
-        def acted(state):
-            asked.append(act(state)["action"])
-            return state.set("action", asked[-1])
-
-        monkeypatch.setattr(trainer.algorithm, "act", acted)
+        acted = spied(trainer.algorithm, "act")
         trainer.run()
         held, _ = trainer.algorithm.replay.contents(0)
-    expected = torch.cat(asked).clamp(-LIMIT, LIMIT)
-    assert torch.cat(asked).abs().max() > LIMIT
-    torch.testing.assert_close(held["action"], expected)
+    asked = torch.cat([chosen["action"] for _, chosen in acted])
+    assert asked.abs().max() > LIMIT
+    torch.testing.assert_close(held["action"], asked.clamp(-LIMIT, LIMIT))
     assert not len(read_table(tmp_path / "run" / "eval.csv"))
     longer = replace(config, episodes=6)  # the dot, unlike most robots, can be saved
     finish(trainer_of(tmp_path / "run", pretrained, longer, resume=True))
