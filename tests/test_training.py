@@ -418,10 +418,9 @@ def test_tasks_begin_for_each_seed_before_they_are_played(begin, make_config, tm
             assert {task for _, task in notes[5:]} <= {0, 2}
 
 
-def test_a_bank_of_other_encoders_is_refused(begin, bank, tmp_path):
-    with pytest.raises(ValueError, match="of others"):
-        begin(tmp_path / "run", bank=replace(bank, encoder_id="of others"))
-    assert not (tmp_path / "run").exists()
+def test_a_bank_of_other_encoders_is_refused(begin, bank, tmp_path, refused):
+    other = replace(bank, encoder_id="of others")
+    refused(lambda: begin(tmp_path / "run", bank=other), "of others", "load both together")
 
 
 def test_a_failure_to_write_the_bank_closes_the_run(begin, tmp_path, monkeypatch):

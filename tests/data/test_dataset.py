@@ -4,6 +4,7 @@ import os
 import shutil
 import warnings
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from bgpo_trl.data.dataset import (
     resize_frames,
     write_demonstrations,
 )
-from tests.helpers import contents, edit
+from tests.helpers import edit
 
 
 @pytest.mark.parametrize(
@@ -110,11 +111,11 @@ def test_episodes_may_be_tensors_that_are_loaded_on_demand(tmp_path):
 @pytest.mark.parametrize(
     ("second", "cause"),
     [
-        (lambda pixels: pixels[:-1], "episode 0 of .* is another one when read again"),
-        (lambda pixels: pixels / 255, "episode 0 of .* has pixels float64"),
+        (lambda pixels: pixels[:-1], "is another one when read again"),
+        (lambda pixels: pixels / 255, "has pixels float64"),
     ],
 )
-def test_an_episode_that_changes_between_two_readings_is_refused(tmp_path, second, cause):
+def test_an_episode_that_changes_between_two_readings_is_refused(tmp_path, refused, second, cause):
     class Changing(OnDemand):
         n_read = 0
 
@@ -123,9 +124,7 @@ def test_an_episode_that_changes_between_two_readings_is_refused(tmp_path, secon
             pixels = episode_of(number + 4)["pixels"]
             return {"pixels": pixels if self.n_read <= len(self) else second(pixels)}
 
-    with pytest.raises(ValueError, match=cause):
-        write(tmp_path / "own", {TASKS[0]: Changing()})
-    assert not (tmp_path / "own").exists()
+    refused(lambda: write(tmp_path / "own", {TASKS[0]: Changing()}), cause, "episode 0 of ")
 
 
 def test_episodes_without_movement_and_such_as_are_given_twice_are_named(tmp_path):
@@ -210,21 +209,17 @@ def test_invalid_episodes_are_refused_before_anything_is_written(
     refused(lambda: write(tmp_path / "made" / "own", episodes), cause, remedy)
 
 
-def test_what_cannot_be_written_leaves_nothing(tmp_path, monkeypatch):
+def test_what_cannot_be_written_leaves_nothing(tmp_path, monkeypatch, refused):
+    call = partial(write, tmp_path / "own", episodes_of())
     for options in ({"held_out_per_task": -1}, {"spread": 1.5}, {"scene": "mars"}):
-        with pytest.raises(ValueError):
-            write(tmp_path / "own", episodes_of(), **options)
+        refused(partial(call, **options), str(*options.values()), "")
     usage = shutil.disk_usage(tmp_path)._replace(free=1000)
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "disk_usage", lambda _: usage)
-        with pytest.raises(OSError, match="make room or choose another folder"):
-            write(tmp_path / "own", episodes_of())
-    assert not [*tmp_path.iterdir()]
-    write(tmp_path / "own", episodes_of())
-    before = contents(tmp_path)
-    with pytest.raises(ValueError, match="exists: choose another folder, or remove it"):
-        write(tmp_path / "own", episodes_of(seed=1))
-    assert contents(tmp_path) == before
+        refused(call, "", "make room or choose another folder")
+    call()
+    again = partial(write, tmp_path / "own", episodes_of(seed=1))
+    refused(again, "exists", "choose another folder, or remove it")
 
 
 @pytest.mark.parametrize(

@@ -161,11 +161,8 @@ def test_the_environment_is_closed_if_a_recording_fails(tmp_path):
         ({"seed": 2**63}, "seed must lie in 0..2"),
     ],
 )
-def test_wrong_arguments_are_refused_before_anything_is_written(tmp_path, wrong, message):
-    with pytest.raises(ValueError, match=message):
-        record_demonstrations(tmp_path / "new", **{**TINY, **wrong})
-
-    assert not (tmp_path / "new").exists()
+def test_wrong_arguments_are_refused_before_anything_is_written(tmp_path, refused, wrong, message):
+    refused(lambda: record_demonstrations(tmp_path / "new", **{**TINY, **wrong}), message, "")
 
 
 def test_the_command_records_all_tasks_by_one_word_and_says_what_it_made(tmp_path):

@@ -169,20 +169,19 @@ class Hidden(Columns):
         return self.factor * super().features(frames)
 
 
-def test_what_a_file_would_not_bring_back_is_not_saved(tmp_path):
+def test_what_a_file_would_not_bring_back_is_not_saved(tmp_path, refused):
     FRAME_NETWORKS[NAME] = Hidden
     hidden = train()
     larger = replace(hidden, lae=SequenceAutoencoder(24, 16))
     named = {**hidden.metadata, "frame_network": "rows 1"}
     for encoders, cause in (
         (hidden, "depends on more than parameters and buffers"),
-        (larger, "RuntimeError: .*size mismatch"),
+        (larger, "size mismatch"),
         (replace(hidden, metadata=named), "there is no frame network 'rows'"),
         (replace(hidden, metadata={}), "KeyError: 'config'"),
     ):
-        with pytest.raises(ValueError, match=f"saved, but not loaded again .*{cause}"):
-            save_representation(encoders, tmp_path / "weights")
-    assert not (tmp_path / "weights").exists()
+        save = partial(save_representation, encoders, tmp_path / "weights")
+        refused(save, "saved, but not loaded again", cause)
 
 
 def odd(change):

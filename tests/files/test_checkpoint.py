@@ -101,13 +101,11 @@ def test_a_full_disk_keeps_earlier_checkpoints(room, tmp_path_factory):
 @pytest.mark.parametrize(
     ("state", "cause"),
     [
-        ({"rng": np.random.default_rng(0)}, r"state\['rng'\] is a Generator"),
-        ({"a": [0.0, {"b": np.float64(1)}]}, r"state\['a'\]\[1\]\['b'\] is a float64"),
-        ({"a": OrderedDict({(1, 2): 0})}, r"state\['a'\] has the key \(1, 2\)"),
+        ({"rng": np.random.default_rng(0)}, "state['rng'] is a Generator"),
+        ({"a": [0.0, {"b": np.float64(1)}]}, "state['a'][1]['b'] is a float64"),
+        ({"a": OrderedDict({(1, 2): 0})}, "state['a'] has the key (1, 2)"),
         (torch.nn.Linear(1, 1), "state is a Linear"),
     ],
 )
-def test_a_state_that_could_not_be_loaded_is_not_saved(state: Any, cause: str, tmp_path):
-    with pytest.raises(ValueError, match=cause):
-        save_checkpoint(tmp_path / "checkpoint", state)
-    assert not (tmp_path / "checkpoint").exists()
+def test_a_state_that_could_not_be_loaded_is_not_saved(state: Any, cause: str, tmp_path, refused):
+    refused(lambda: save_checkpoint(tmp_path / "checkpoint", state), cause, "")
