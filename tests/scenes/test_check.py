@@ -152,8 +152,10 @@ def test_joints_of_another_size_than_the_scene_says_are_refused():
         def joints(self):
             return [self.place]
 
-    with pytest.raises(ValueError, match=r"Short.joints\(\) returned .*: return 2 finite"):
-        check_scene(scene(Short, joints=StateColumns(center=[0, 0], scale=[1, 1])))
+    robot = scene(Short, joints=StateColumns(center=[0, 0], scale=[1, 1]))
+    for call in (lambda: check_scene(robot), robot.simulate(["left"]).reset):
+        with pytest.raises(ValueError, match=r"Short.joints\(\) returned .*: return 2 finite"):
+            call()
 
 
 def test_a_physical_robot_is_not_moved_and_its_connection_is_closed():
