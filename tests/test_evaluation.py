@@ -153,6 +153,7 @@ def test_test_episodes_equal_a_plain_loop_over_one_environment(
                     success = bool(now["terminated"])
                 assert bool(result.success[index, task, episode]) == success
                 assert int(result.steps[index, task, episode]) == steps
+    assert not copied[0][0][1].equal(copied[1][0][1])  # each seed draws its own demonstrations
     assert 0 < result.success.float().mean() < 1
     assert len(result.steps.unique()) > 2
 
