@@ -71,15 +71,7 @@ def measure(
     acts: Mapping[str, Act], frames: Sequence[np.ndarray], rounds: int
 ) -> dict[str, list[float]]:
     """Return the CPU times of an action (s), one per round, by contender."""
-
-    def of_all(act: Act) -> Callable[[], None]:
-        def call() -> None:
-            for frame in frames:
-                act(frame)
-
-        return call
-
-    calls = {name: of_all(act) for name, act in acts.items()}
+    calls = {name: lambda act=act: [act(frame) for frame in frames] for name, act in acts.items()}
     times = interleave(calls, rounds=rounds, clock=time.process_time)
     return {name: [seconds / len(frames) for seconds in found] for name, found in times.items()}
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from shared import (
     Episode,
     TrainedArguments,
-    load_blocks_of_nico,
+    load_blocks,
     play,
     random_actions,
     write_measurement,
@@ -342,7 +342,7 @@ def episodes_of(arguments: AftermathArguments) -> dict[str, list[Episode]]:
     max_steps = round(TIME_LIMIT / CONTROL_TIMESTEP)
     episodes: dict[str, list[Episode]] = {}
     if arguments.run is not None:
-        runs = load_blocks_of_nico(arguments.run)
+        runs = load_blocks(arguments.run, of_nico=True)
         config = runs[0].config
         tasks, max_steps, spread = config.tasks, config.algorithm.max_steps, config.spread
         seeds = [seed for run in runs for seed in run.config.seeds]

@@ -17,8 +17,8 @@ The folder is that of `benchmarks/continual_world.py`; demonstrations are record
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -34,6 +34,7 @@ from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.representation import valid_frames, valid_steps
+from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.experiments.groups import draw, form
 from bgpo_trl.experiments.settings import even_starts
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
@@ -46,16 +47,16 @@ SHOWN, HELD_OUT, TESTS, MAX_STEPS = 30, 10, 20, 50
 COMPONENTS, NOISE, LIMIT, LEAST = 64, 0.2, 5.0, 0.1
 DRAWS, SEEDS = 600, (0, 1, 2)
 
-Observe = Callable[[ContinualWorld], Tensor]
+Act = Callable[[ContinualWorld], np.ndarray]
 
 
 def perform(
-    simulation: ContinualWorld, act: Callable[[], np.ndarray], observe: Observe
+    simulation: ContinualWorld, act: Callable[[], np.ndarray]
 ) -> tuple[list[Tensor], list[np.ndarray], bool]:
-    """Act to the end of an episode; return observations and actions, and whether it succeeded."""
+    """Act to the end of an episode; return ground truth and actions, and whether it succeeded."""
     seen, actions = [], []
     for _ in range(MAX_STEPS):
-        seen.append(observe(simulation))
+        seen.append(truth(simulation))
         actions.append(act())
         if simulation.step(actions[-1]).success:
             return seen, actions, True
@@ -78,7 +79,7 @@ def demonstrate(task: str) -> tuple[Tensor, Tensor]:
             simulation.seed(start)
             simulation.reset(task)
             act = demonstrator(simulation, task, noise)
-            states, done, success = perform(simulation, act, truth)
+            states, done, success = perform(simulation, act)
         seen += states
         actions += done
     return torch.stack(seen), torch.from_numpy(np.array(actions)).float()
@@ -116,16 +117,15 @@ def clone(seen: Tensor, actions: Tensor) -> nn.Sequential:
     return policy.requires_grad_(False)
 
 
-def success(task: str, policy: nn.Module, observe: Observe) -> float:
-    """Return the share of new starts from which a policy succeeds."""
+def success(task: str, acts: Sequence[Act]) -> float:
+    """Return the share of new starts, one for each of ``acts``, from which these succeed."""
     simulation = ContinualWorld({})
     simulation.seed(12_345)
     won = 0
-    for _ in range(TESTS):
+    for act in acts:
         simulation.reset(task)
-        act = lambda: policy(observe(simulation)).double().numpy()  # noqa: E731
-        won += perform(simulation, act, observe)[2]
-    return won / TESTS
+        won += perform(simulation, partial(act, simulation))[2]
+    return won / len(acts)
 
 
 def clone_of_truth(task: str) -> float:
@@ -134,7 +134,11 @@ def clone_of_truth(task: str) -> float:
     mean, scale = seen.mean(0), seen.std(0)
     scale = scale.clamp_min(LEAST * scale[scale > 0].median())
     policy = clone((seen - mean) / scale, actions)
-    return success(task, policy, lambda simulation: (truth(simulation) - mean) / scale)
+
+    def act(simulation: ContinualWorld) -> np.ndarray:
+        return policy((truth(simulation) - mean) / scale).double().numpy()
+
+    return success(task, [act] * TESTS)
 
 
 def clone_of_frames(
@@ -146,23 +150,18 @@ def clone_of_frames(
     seen = encode(dataset["pixels"][rows][:, :-1][valid]).clamp(-LIMIT, LIMIT)
     policy = clone(seen, dataset["action"][rows][valid])
 
-    def observe(simulation: ContinualWorld) -> Tensor:
-        return encode(torch.from_numpy(simulation.frame())).clamp(-LIMIT, LIMIT)
+    def act(simulation: ContinualWorld) -> np.ndarray:
+        latent = encode(torch.from_numpy(simulation.frame())).clamp(-LIMIT, LIMIT)
+        return policy(latent).double().numpy()
 
-    return success(task, policy, observe)
+    return success(task, [act] * TESTS)
 
 
 def success_of_replay(task: str, dataset: TensorDictBase) -> float:
     """Return the success of the actions of demonstrations, a different one from each new start."""
     rows = (dataset["task"] == CW10.index(task)) & dataset["train"]
-    simulation = ContinualWorld({})
-    simulation.seed(12_345)
-    won = 0
-    for actions in dataset["action"][rows][:TESTS].double():
-        simulation.reset(task)
-        turn = iter(actions.numpy())
-        won += perform(simulation, partial(next, turn), truth)[2]
-    return won / TESTS
+    turns = [iter(actions.numpy()) for actions in dataset["action"][rows][:TESTS].double()]
+    return success(task, [lambda _, turn=turn: next(turn) for turn in turns])
 
 
 def embed(dataset: TensorDictBase, encode: Callable[[Tensor], Tensor], seed: int) -> Tensor:
@@ -202,41 +201,35 @@ def print_groups(dataset: TensorDictBase, encode: Callable[[Tensor], Tensor]) ->
             print(seed, order, len(groups.numbers), f"{purity:.0f} %", flush=True)
 
 
-def main(
-    what: tyro.conf.Positional[Literal["truth", "frames", "groups", "replay"]],
-    folder: Path = Path("runs/cw10/demonstrations"),
-    tasks: tuple[str, ...] = CW10,
-) -> None:
-    """Measure what limits clones and groups.
+@dataclass(frozen=True)
+class Arguments:
+    """What limits clones and groups."""
 
-    Args:
-        what: What clones observe, or groups, or the replay of actions.
-        folder: Folder of the demonstrations.
-        tasks: Tasks to clone.
-    """
+    what: tyro.conf.Positional[Literal["truth", "frames", "groups", "replay"]]
+    """What clones observe, or groups, or the replay of actions."""
+    folder: Path = Path("runs/cw10/demonstrations")
+    """Folder of the demonstrations."""
+    tasks: tuple[str, ...] = CW10
+    """Tasks to clone."""
+
+
+def main(arguments: Arguments) -> None:
+    """Measure what limits clones and groups."""
     torch.set_num_threads(1)
-    if what == "truth":
-        for task in tasks:
-            print(task, clone_of_truth(task), flush=True)
-        return
-    recorded = record_demonstrations(
-        folder, scene="cw10", per_task=SHOWN + HELD_OUT, held_out_per_task=HELD_OUT
-    )
-    dataset = recorded.clone()
-    if what == "replay":
-        for task in tasks:
-            print(task, success_of_replay(task, dataset), flush=True)
-        return
-    encode = components(dataset)
-    if what == "groups":
-        print_groups(dataset, encode)
-        return
-    for task in tasks:
-        print(task, clone_of_frames(task, dataset, encode), flush=True)
+    measure = clone_of_truth
+    if arguments.what != "truth":
+        recorded = record_demonstrations(
+            arguments.folder, scene="cw10", per_task=SHOWN + HELD_OUT, held_out_per_task=HELD_OUT
+        )
+        dataset = recorded.clone()
+        if arguments.what == "groups":
+            return print_groups(dataset, components(dataset))
+        measure = partial(success_of_replay, dataset=dataset)
+        if arguments.what == "frames":
+            measure = partial(clone_of_frames, dataset=dataset, encode=components(dataset))
+    for task in arguments.tasks:
+        print(task, measure(task), flush=True)
 
 
 if __name__ == "__main__":
-    try:
-        tyro.cli(main, description=__doc__)
-    except (ValueError, OSError, RuntimeError) as error:
-        sys.exit(f"error: {error}")
+    command_line(main, line=__doc__)

@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 from shared import (
     TrainedArguments,
-    load_blocks_of_nico,
+    load_blocks,
     play,
     random_actions,
     style_success,
@@ -279,7 +279,7 @@ def looking(arguments: TrainedArguments) -> str:
     commit, out = commit_of_code(), arguments.out or arguments.run
     set_threads(1)
     opengl.check()  # before the progress bar
-    runs, rows = load_blocks_of_nico(arguments.run), list[Row]()
+    runs, rows = load_blocks(arguments.run, of_nico=True), list[Row]()
     check_folder(out)
     for run in runs:
         steps = len(VIEWS) * (run.config.algorithm.max_steps + 1)

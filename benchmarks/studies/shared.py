@@ -44,27 +44,18 @@ class TrainedArguments(ImportArguments):
             raise ValueError(f"--episodes must be at least 1, got {self.episodes}")
 
 
-def load_blocks(run: Path) -> list[LoadedRun]:
+def load_blocks(run: Path, *, of_nico: bool = False) -> list[LoadedRun]:
     """Load all seeds of a run: the run itself, or the runs of single seeds in its folder.
 
     Raises:
-        ValueError: As for `load_all_seeds`.
+        ValueError: As for `load_all_seeds`, or if the run is not ``of_nico`` and has to be.
     """
-    blocks = sorted(path for path in run.glob("seeds-*") if has_checkpoint(path / "checkpoint"))
-    if not blocks or has_checkpoint(run / "checkpoint"):
-        blocks = [run]
-    return [load_all_seeds(block) for block in blocks]
-
-
-def load_blocks_of_nico(run: Path) -> list[LoadedRun]:
-    """Load all seeds of a run of NICO, see `load_blocks`.
-
-    Raises:
-        ValueError: As for `load_blocks`, or if the run is of another scene.
-    """
-    blocks = load_blocks(run)
+    paths = sorted(path for path in run.glob("seeds-*") if has_checkpoint(path / "checkpoint"))
+    if not paths or has_checkpoint(run / "checkpoint"):
+        paths = [run]
+    blocks = [load_all_seeds(path) for path in paths]
     scene = blocks[0].config.scene
-    if scene != "nico":
+    if of_nico and scene != "nico":
         raise ValueError(f"{run} is a run of the scene {scene!r}: this test is of NICO's table")
     return blocks
 
