@@ -83,32 +83,20 @@ def calls_per_round(gwr: GWRB, weights: Tensor, n_inputs: int) -> dict[str, Call
     """Return the calls to time, each of which processes ``n_inputs`` inputs in turn."""
     generator = torch.Generator().manual_seed(0)
     n_networks, n_nodes, n_features = weights.shape
+    row = torch.randint(n_nodes, (n_inputs, n_networks), generator=generator)
+    noise = torch.randn(n_inputs, n_networks, n_features, generator=generator)
+    fixed = weights[torch.arange(n_networks), row] + 0.02 * noise
 
-    def inputs() -> Tensor:
-        row = torch.randint(n_nodes, (n_inputs, n_networks), generator=generator)
-        noise = torch.randn(n_inputs, n_networks, n_features, generator=generator)
-        return weights[torch.arange(n_networks), row] + 0.02 * noise
+    def of_all(*methods: Callable[[Tensor], object]) -> Callable[[], None]:
+        def call() -> None:
+            for phi in fixed:
+                for method in methods:
+                    method(phi)
 
-    fixed = inputs()
+        return call
 
-    def lookup() -> None:
-        for phi in fixed:
-            gwr.lookup(phi)
-
-    def adapt() -> None:
-        for phi in fixed:
-            gwr.adapt(phi)
-
-    def lookup_adapt() -> None:
-        for phi in fixed:
-            gwr.lookup(phi)
-            gwr.adapt(phi)
-
-    def read() -> None:
-        for _ in fixed:
-            weights.sum()
-
-    return {**dict(zip(CALLS, (lookup, adapt, lookup_adapt), strict=True)), "read": read}
+    methods = (gwr.lookup,), (gwr.adapt,), (gwr.lookup, gwr.adapt), (lambda _: weights.sum(),)
+    return {name: of_all(*some) for name, some in zip((*CALLS, "read"), methods, strict=True)}
 
 
 def measure(n_networks: int, n_nodes: int, arguments: Arguments) -> dict[str, Any]:

@@ -27,12 +27,6 @@ def known_mean(values: Values, axis: int = 0) -> Values:
     return np.ma.filled(np.ma.masked_invalid(values).mean(axis), np.nan)
 
 
-def _in_window(episodes: ArrayLike, end: int, window: int) -> NDArray[np.bool_]:
-    """Return which ``episodes`` ``[E]`` are among the last ``window`` until ``end``, ``[E]``."""
-    episodes = np.asarray(episodes)
-    return (episodes > end - window) & (episodes <= end)
-
-
 def late_window(run: Run) -> int:
     """Return the length of the last 10 % of training in episodes, at least one test."""
     return max(run.eval_every, round(0.1 * run.last))
@@ -49,7 +43,7 @@ def evaluation_matrix(run: Run, ends: Sequence[int], window: int) -> Values:
     """
     phases = []
     for end in ends:
-        chosen = _in_window(run.episodes, end, window)
+        chosen = (run.episodes > end - window) & (run.episodes <= end)
         if not chosen.any():
             raise ValueError(
                 f"there is no evaluation in the {window} episodes before episode {end}: test "
@@ -107,17 +101,6 @@ def area_scores(run: Run) -> Values:
     return np.stack(areas, axis=-1)
 
 
-def _phases(run: Run) -> tuple[list[int], int]:
-    """Return the last episode of each task's phase, and a fifth of the shortest, in episodes."""
-    ends = [*run.starts[1:], run.last]
-    lengths = [end - start for start, end in zip(run.starts, ends, strict=True)]
-    if min(lengths) <= 0:
-        raise ValueError(
-            f"{run.directory} starts its tasks at {run.starts}: only for tasks one after the other"
-        )
-    return ends, max(run.eval_every, min(lengths) // 5)
-
-
 def success_matrix(run: Run) -> Values:
     """Return ``R[i, j]``, the success on task j at the end of phase i, ``[S, T, T]``.
 
@@ -127,7 +110,13 @@ def success_matrix(run: Run) -> Values:
     Raises:
         ValueError: If tasks do not start one after the other, or a phase has no test of its task.
     """
-    ends, window = _phases(run)
+    ends = [*run.starts[1:], run.last]
+    shortest = min(np.subtract(ends, run.starts).tolist())
+    if shortest <= 0:
+        raise ValueError(
+            f"{run.directory} starts its tasks at {run.starts}: only for tasks one after the other"
+        )
+    window = max(run.eval_every, shortest // 5)
     matrix = evaluation_matrix(run, ends, window)
     if np.isnan(np.diagonal(matrix, axis1=-2, axis2=-1)).any():
         raise ValueError(
@@ -175,7 +164,7 @@ def success_steps(run: Run) -> Values:
 
     NaN for tasks without a success, and in runs without the steps of tests.
     """
-    late = _in_window(run.tests["episode"], run.last, late_window(run))
+    late = run.tests["episode"] > run.last - late_window(run)
     won = run.tests[late & (run.tests["success"] == 1)]
     return run.by_seed_and_task(won.groupby(["seed", "task"])["steps"].mean())
 

@@ -42,7 +42,7 @@ def encoders(arguments: EncodersArguments) -> str:
     scene, keep = find_scene(meta["scene"]), arguments.keep
     train_encoders(
         dataset,
-        _play(arguments.play),
+        arguments.play and load_demonstrations(arguments.play),
         arguments.weights or arguments.folder / "encoders.safetensors",
         arguments.folder,
         arguments.config,
@@ -65,11 +65,6 @@ def _demonstrations(path: Path) -> tuple[TensorDict, dict[str, Any]]:
             "first, that of play second"
         )
     return load_demonstrations(path), meta
-
-
-def _play(path: Path | None) -> TensorDict | None:
-    """Open recorded play, if any."""
-    return None if path is None else load_demonstrations(path)
 
 
 def bank(arguments: MakeBankArguments) -> str:
@@ -96,6 +91,7 @@ def probes(arguments: ProbesArguments) -> str:
     dataset, meta = _demonstrations(arguments.dataset)
     scene = find_scene(meta["scene"])
     weights = arguments.encoders or default_weights(meta["tasks"], scene=scene)
-    representation, play = load_representation(weights, scene=scene), _play(arguments.play)
+    representation = load_representation(weights, scene=scene)
+    play = arguments.play and load_demonstrations(arguments.play)
     probe(representation, dataset, arguments.out, play=play, columns=scene.state)
     return verdict_in(arguments.out, scene)

@@ -202,8 +202,7 @@ def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.n
         ValueError: If the run observes ground truth instead of frames.
     """
     config, frames = trainer.config, []
-    held_out = bank.held_out(config.held_out)
-    evaluator = _evaluator(trainer, held_out, 1)
+    evaluator = _evaluator(trainer, bank.held_out(config.held_out), 1)
     result = evaluator.run(
         evaluator.snapshots(trainer.algorithm, _LAST),
         trainer.algorithm.device,
