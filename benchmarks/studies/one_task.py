@@ -138,15 +138,8 @@ class Trial:
             optimizer.zero_grad()
             distance.backward()
             optimizer.step()
-        with torch.no_grad():
-            for params in (loss.actor_network_params, loss.target_actor_network_params):
-                pairs = zip(
-                    params.values(True, True),
-                    loss.clone_network_params.values(True, True),
-                    strict=True,
-                )
-                for tensor, cloned in pairs:
-                    tensor.copy_(cloned)
+        for params in (loss.actor_network_params, loss.target_actor_network_params):
+            params.data.copy_(loss.clone_network_params.data)
 
     def batch(self, n_shown: int, n_played: int) -> TensorDict:
         """Draw transitions ``[1, 1, B]``, and as many demonstrated actions to imitate."""
