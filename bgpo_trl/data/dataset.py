@@ -32,6 +32,9 @@ _REMEDY = (
 def load_demonstrations(path: str | Path) -> TensorDict:
     """Open a dataset of `record_demonstrations` or `write_demonstrations`, memory-mapped.
 
+    What is written to it changes its files, which would then be refused as damaged: change a copy,
+    ``dataset.to_tensordict()``.
+
     Raises:
         ValueError: If it is missing, incomplete, damaged, of another version of its scene, or of
             logged episodes, which may have failed.
