@@ -107,10 +107,11 @@ def make_config():
             small["proposals"] = "actor"
         rl = replace(entry(name).config.rl, **{**small, **(rl or {})})
         settings = {"state": state, "max_steps": 6, "rl": rl, **of_name(SMALL, name)}
-        settings |= {"demonstration_share": share, "demonstration_noise": 0.0}
         if isinstance(entry(name).config, BGPOConfig):
             settings |= {"expert_batch_size": 8, "group_size": 4}
-        algorithm = replace(entry(name).config, **{**settings, **(algorithm or {})})
+        settings |= {"demonstration_share": share, **(algorithm or {})}
+        settings["demonstration_noise"] = 0.0 if settings["demonstration_share"] else None
+        algorithm = replace(entry(name).config, **settings)
         config = RunConfig(
             seeds=(3, 8),
             episodes=10,

@@ -134,6 +134,12 @@ def test_what_the_paper_has_does_not_mix_with_demonstrations_as_experience(confi
         config(demonstration_share=0.75, **{name: True})
 
 
+@pytest.mark.parametrize("name", ["demonstration_pace", "demonstration_noise"])
+def test_how_to_imitate_is_refused_where_nothing_is_imitated(name):
+    with pytest.raises(ValueError, match=rf"{name} must be left out where .* is 0.*, got 0\.5"):
+        BGPOConfig(experts=False, demonstration_share=0.0, rl=RLConfig(), **{name: 0.5})
+
+
 def test_config_files_hold_every_number_that_acts():
     assert None not in asdict(RunConfig()).values()
     of_bank = {"demonstration_noise"}  # whose digest the run holds

@@ -194,11 +194,14 @@ class AlgorithmConfig(Settings):
         share, rl = self.demonstration_share, self.rl
         beside = self.state == "latent" or not self.joints
         imitable = "above 0 for a policy to imitate (bgpo-experts: without)"
+        unused = "left out where demonstration_share is 0: nothing is imitated"
         check(
             self,
             ("demonstration_share", 0 <= share < 1, "at least 0 and below 1"),
             ("joints", beside, "off with state='state', which tells more"),
             ("demonstration_share", share > 0 or not rl.imitates, imitable),
+            ("demonstration_pace", share > 0 or self.demonstration_pace == 1, unused),
+            ("demonstration_noise", share > 0 or self.demonstration_noise is None, unused),
         )
         at_least(self, 1, "max_steps")
         if self.state_limit is not None:
