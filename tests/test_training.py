@@ -185,7 +185,8 @@ def test_a_run_extended_in_steps_equals_a_longer_run(begin, make_config, tmp_pat
     config, whole, parts = make_config(episodes=16), Recorder(), [Recorder(), Recorder()]
     finish(begin(straight, config, loggers=[whole]))
     for episodes in (12, 13):
-        finish(begin(run, replace(config, episodes=episodes), resume=True))
+        part = replace(config, episodes=episodes, checkpoint_minutes=float(episodes))
+        finish(begin(run, part, resume=True))
         played = sorted((row["seed"], int(row["episode"])) for row in rows(run / "train.csv"))
         assert played == [(seed, n + 1) for seed in "38" for n in range(episodes)]
         assert load_checkpoint(run / "checkpoint")["later"]

@@ -78,6 +78,11 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
     if arguments.resume and (out / "config.json").exists():
         saved, digests = read_config(out / "config.json")
         config = _continued(arguments, config, saved)
+        if added is None and arguments.tasks and config.tasks != saved.tasks:
+            raise ValueError(
+                f"--tasks: {out} has the tasks {', '.join(saved.tasks)}: leave the flag out, or "
+                "give it another one with --add-task"
+            )
         if added in saved.tasks[-1:]:  # the same command once more; the run has the bank
             added, arguments = None, replace(arguments, bank=None)
         if added is None and saved == config and is_finished(out, config.episodes):

@@ -47,7 +47,7 @@ def save_checkpoint(directory: str | os.PathLike[str], state: dict[str, Any]) ->
         >>> load_checkpoint(directory)
         {'episode': 7, 'weight': tensor([1., 1.])}
     """
-    _check_state(state, "state")
+    check_state(state, "state")
     directory = Path(directory)
     temporary = directory / "checkpoint.tmp"
     earlier = _checkpoints(directory)
@@ -137,17 +137,18 @@ def _checkpoints(directory: Path) -> list[Path]:
     return sorted(directory.glob("checkpoint-[0-9]*.pt"), key=_number, reverse=True)
 
 
-def _check_state(value: Any, where: str) -> None:
+def check_state(value: Any, where: str) -> None:
+    """Raise ``ValueError`` unless a checkpoint can hold a value, ``where`` it stands."""
     # Exact types: subclasses such as numpy.float64 or a memory-mapped tensor are pickled with
     # their class, which torch.load(weights_only=True) refuses.
     if type(value) in (dict, OrderedDict):
         for key, item in value.items():
             if type(key) not in (str, int):
                 raise ValueError(f"{where} has the key {key!r}: a checkpoint takes str and int.")
-            _check_state(item, f"{where}[{key!r}]")
+            check_state(item, f"{where}[{key!r}]")
     elif type(value) in (list, tuple):
         for index, item in enumerate(value):
-            _check_state(item, f"{where}[{index}]")
+            check_state(item, f"{where}[{index}]")
     elif type(value) not in _PLAIN_TYPES:
         raise ValueError(
             f"{where} is a {type(value).__name__}, which a checkpoint cannot hold: turn it into "

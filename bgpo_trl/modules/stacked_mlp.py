@@ -64,14 +64,20 @@ class StackedLinear(nn.Module):
         batch_size = as_shape(batch_size, "batch_size")
         self.weight = nn.Parameter(torch.empty(*batch_size, in_features, out_features))
         self.bias = nn.Parameter(torch.empty(*batch_size, out_features))
+        self.reset_parameters(generator)
+
+    @torch.no_grad()
+    def reset_parameters(
+        self, generator: torch.Generator | Sequence[torch.Generator] | None = None
+    ) -> None:
+        """Draw the weights anew, from generators as those of the class."""
         # One generator draws all layers at once, several draw one layer each.
-        n_draws = batch_size.numel() if isinstance(generator, Sequence) else 1
-        streams, bound = one_each(generator, n_draws), 1 / math.sqrt(in_features)
-        with torch.no_grad():
-            weights, biases = self.weight.view(n_draws, -1), self.bias.view(n_draws, -1)
-            for weight, bias, stream in zip(weights, biases, streams, strict=True):
-                weight.uniform_(-bound, bound, generator=stream)
-                bias.uniform_(-bound, bound, generator=stream)
+        n_draws = self.batch_size.numel() if isinstance(generator, Sequence) else 1
+        streams, bound = one_each(generator, n_draws), 1 / math.sqrt(self.in_features)
+        weights, biases = self.weight.view(n_draws, -1), self.bias.view(n_draws, -1)
+        for weight, bias, stream in zip(weights, biases, streams, strict=True):
+            weight.uniform_(-bound, bound, generator=stream)
+            bias.uniform_(-bound, bound, generator=stream)
 
     @property
     def batch_size(self) -> torch.Size:

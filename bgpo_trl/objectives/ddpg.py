@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
@@ -239,21 +239,23 @@ class DDPGLoss(LossModule):
         """Set the estimator of the target.
 
         Args:
-            value_type: ``ValueEstimators.TD0`` or a value estimator of TorchRL.
+            value_type: ``ValueEstimators.TD0``, or a ``TD0Estimator`` of TorchRL.
             **hyperparams: Arguments of the estimator; ``gamma`` is `RLConfig.gamma` by default.
 
         Raises:
             ValueError: If gamma does not lie in [0, 1].
-            NotImplementedError: If the estimator is another one of ``ValueEstimators``.
+            NotImplementedError: If the estimator is another one.
         """
         hyperparams = {"gamma": RLConfig.gamma, "value_network": None, **hyperparams}
         if not 0 <= hyperparams["gamma"] <= 1:
             raise ValueError(f"gamma must be between 0 and 1, got {hyperparams['gamma']}")
         if value_type is None or value_type == ValueEstimators.TD0:
             value_type = TD0Estimator
-        elif isinstance(value_type, ValueEstimators):
-            raise NotImplementedError(f"{value_type} needs whole trajectories: choose TD0")
-        super().make_value_estimator(value_type, **hyperparams)
+        kind = value_type if isinstance(value_type, type) else type(value_type)
+        if not issubclass(kind, TD0Estimator):
+            name = value_type if isinstance(value_type, ValueEstimators) else kind.__name__
+            raise NotImplementedError(f"{name} needs whole trajectories: choose TD0")
+        super().make_value_estimator(cast(Any, value_type), **hyperparams)
         self.set_keys()  # the names of the entries, to the estimator too
 
     @dispatch()
@@ -314,10 +316,13 @@ class DDPGLoss(LossModule):
         proposals = [self.call_network("target_actor_network", successor.copy())]
         if self.has_clone:
             proposals.append(self.call_network("clone_network", successor.copy()))
+        if not self.ensemble:  # whose critic may be any module, such as one with batch norm
+            values = [self.values("target_value_network", one) for one in proposals]
+            return values[0] if len(values) == 1 else torch.maximum(*values)
         dim, keys = len(self.batch_size), self.value_network.in_keys
         data = TensorDict.maybe_dense_stack([one.select(*keys) for one in proposals], dim)
         values = self.values("target_value_network", data, critics=self.pair)
-        return (values.amin(dim) if self.ensemble else values).amax(dim)
+        return values.amin(dim).amax(dim)
 
     @property
     def pair(self) -> tuple[int, int]:

@@ -123,11 +123,15 @@ def _compare(where: Path, saved: Mapping[str, Any], settings: Mapping[str, Any])
 def _as_grown(saved: Mapping[str, Any], settings: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return settings with the length and further tasks of others, if they could grow into these.
 
+    How often checkpoints are written changes nothing that is learned.
+
     Demonstrations of further tasks change the digest of the bank, which `Trainer` checks.
     """
     grown = dict(saved)
     if type(saved.get("episodes")) is type(settings.get("episodes")) is int:
         grown["episodes"] = max(saved["episodes"], settings["episodes"])
+    if "checkpoint_minutes" in settings:
+        grown["checkpoint_minutes"] = settings["checkpoint_minutes"]
     of_tasks = ("tasks", "task_starts")
     lists = [(saved.get(name), settings.get(name)) for name in of_tasks]
     if all(

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 import numpy as np
 from numpy.typing import NDArray
 
+from bgpo_trl.files.checkpoint import check_state
 from bgpo_trl.scenes.scene import (
     Scene,
     Simulation,
@@ -149,6 +150,10 @@ class _Trial:
             saved = self.simulation.save()
         except NotImplementedError:
             return []
+        try:
+            check_state(saved, "save()")
+        except ValueError as error:
+            return [f"runs could not be saved: {error}"]
         ahead = self.ahead()
         for trial in (self, other):
             trial.simulation.load(saved)

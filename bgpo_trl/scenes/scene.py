@@ -243,7 +243,7 @@ class Scene:
             version in all files, see `full_version`.
         tasks: Names of all tasks; may grow while the program runs.
         default_tasks: Names of the tasks of an experiment by default.
-        own_tasks: Names of the tasks that come with the scene; the default ones if None.
+        own_tasks: Names of the tasks that come with the scene; all of them if None.
         make_env: Constructor of the environment, which gets the tasks, the `sizes` and what
             `simulate` is given; a ``spread`` only with ``has_spread``. It is `SimulationEnv` around
             a `Simulation`, or an ``EnvBase`` with the same keys, attributes and methods. Without
@@ -357,7 +357,7 @@ class Scene:
     @property
     def all_tasks(self) -> tuple[str, ...]:
         """Names of the tasks that come with the scene."""
-        return self.default_tasks if self.own_tasks is None else self.own_tasks
+        return tuple(self.tasks) if self.own_tasks is None else self.own_tasks
 
     @property
     def sizes(self) -> dict[str, Any]:

@@ -12,6 +12,8 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import (
     Compose,
     EnvBase,
+    FrameSkipTransform,
+    MultiAction,
     RandomTruncationTransform,
     RewardSum,
     StepCounter,
@@ -140,6 +142,10 @@ class EpisodeTransform(Transform):
                 f"put {type(late).__name__} before {type(self).__name__}, which has to see where "
                 "episodes end"
             )
+        skips = any(isinstance(t, FrameSkipTransform) for t in after)
+        if skips or any(isinstance(t, MultiAction) for t in before):
+            order = "FrameSkipTransform before" if skips else "MultiAction after"
+            raise ValueError(f"put {order} {type(self).__name__}, which has to see each step once")
         sums = any(isinstance(t, RewardSum) for t in before)
         if self.changes_reward and (sums or "episode_reward" in _names(observation_spec)):
             raise ValueError(f"put RewardSum after {type(self).__name__}, which changes the reward")

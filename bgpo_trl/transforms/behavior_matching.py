@@ -40,8 +40,8 @@ class BehaviorMatchingReward(EpisodeTransform):
         beta: Weight of the intrinsic reward, which is measured even if 0.
 
     Raises:
-        ValueError: If beta is negative, or latents, behaviors or rewards are missing or of another
-            size than the encoder's.
+        ValueError: If beta is negative, latents, behaviors or rewards are missing or of another
+            size than the encoder's, rewards are integers, or a last latent is NaN or Inf.
 
     Examples:
         >>> from types import SimpleNamespace
@@ -95,10 +95,17 @@ class BehaviorMatchingReward(EpisodeTransform):
             for key, before in (("lae_h", h), ("lae_c", c)):
                 next_tensordict.set(key, torch.where(rows, next_tensordict.get(key), before))
         extrinsic = next_tensordict.get("reward")
+        if not extrinsic.is_floating_point():  # in which the intrinsic reward would be 0
+            raise ValueError(f"rewards are {extrinsic.dtype}: append DTypeCastTransform before")
         intrinsic = torch.zeros_like(extrinsic)
         ended = ending(tensordict, next_tensordict)
         if ended.any():
             bonus = torch.where(ended, matching_reward(tensordict.get("behavior"), phi), 0)
+            if not bonus.isfinite().all():
+                raise ValueError(
+                    "the latent at the end of an episode is NaN or Inf, as in an environment that "
+                    "resets itself (auto_reset=True): let TorchRL reset it"
+                )
             intrinsic = bonus.unsqueeze(-1).to(extrinsic.dtype)
         next_tensordict.set("extrinsic_reward", extrinsic)
         next_tensordict.set("intrinsic_reward", intrinsic)

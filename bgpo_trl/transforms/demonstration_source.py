@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Integral
-from typing import Protocol, Self
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -113,7 +113,9 @@ class DemonstrationSource(EpisodeTransform):
 
     Reads ``done``; writes ``task`` int64 ``[*B]``, ``demo_embedding`` float32 ``[*B, 32]`` and
     ``demo_index`` int64 ``[*B]`` (position in the bank). An environment that is made of transformed
-    environments must have ``task`` in its ``state_spec``, in order to read it.
+    environments must have ``task`` in its ``state_spec``, in order to read it. A ``clone`` shares
+    counts and streams, as TorchRL expects where it wraps an environment twice; of one by itself,
+    take a ``copy.deepcopy``.
 
     Args:
         bank: The demonstrations; other dtypes become float32 and int64.
@@ -177,7 +179,7 @@ class DemonstrationSource(EpisodeTransform):
         self.schedule = schedule
         self.register_buffer("_stream", _streams(sources).view(batch_size))
         self.register_buffer("episode", torch.zeros(batch_size, dtype=torch.int64))
-        self.register_buffer("_embedding", bank.embedding.float(), persistent=False)
+        self.register_buffer("_embedding", bank.embedding.detach().float(), persistent=False)
         self.register_buffer("_task", bank.task.long(), persistent=False)
         self.register_buffer("_demo_index", torch.zeros_like(self.episode), persistent=False)
 
@@ -186,12 +188,6 @@ class DemonstrationSource(EpisodeTransform):
         seeds = row_seeds(seeds, self.episode.numel())
         self._stream.copy_(_streams(generators(seeds, "demonstrations")).view_as(self._stream))
         self.episode.zero_()
-
-    def clone(self) -> Self:
-        """Return a copy with counts and streams of its own, where TorchRL's would share them."""
-        copy = super().clone()
-        copy._buffers = {key: buffer.clone() for key, buffer in self.named_buffers()}
-        return copy
 
     def _draw(self, rows: Tensor) -> None:
         available = self.schedule.available(self.episode)[rows].tolist()

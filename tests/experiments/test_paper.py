@@ -125,6 +125,8 @@ def test_a_finished_run_is_only_changed_by_making_it_longer(
         refused(changed, "holds a run with other settings", "choose another")
     with_others = replace(again, episodes=9, encoders=default_weights())
     refused(partial(continual, with_others), "--encoders: ", "was begun with the encoders")
+    two = replace(again, episodes=9, tasks=TASKS[:2])
+    refused(partial(continual, two), f"has the tasks {', '.join(TASKS)}", "leave the flag out")
     trained = replace(again, episodes=9, train_encoders=True)
     refused(partial(continual, trained), "--train-encoders: ", "leave the flag out")
     from_start = partial(concurrent, replace(again, episodes=9))

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl import objectives
-from torchrl.objectives.value import TD0Estimator
+from torchrl.objectives.value import TD0Estimator, TDLambdaEstimator
 
 from bgpo_trl.configs import RLConfig
 from bgpo_trl.modules.actor_critic import Actor, Critic, ProposalPolicy
@@ -329,3 +329,39 @@ def test_an_actor_without_pre_tanh_actions_needs_no_penalty_and_reports_no_magni
     torch.testing.assert_close(magnitude, action.square().mean().sqrt().detach())
     free = DDPGLoss(actor, critic, pre_tanh_penalty=0)
     assert set(free.out_keys) == set(free(batch).keys())
+
+
+class Normed(torch.nn.Module):
+    """A critic that sees a whole batch at once, through batch norm."""
+
+    def __init__(self):
+        super().__init__()
+        self.norm, self.out = torch.nn.BatchNorm1d(STATE + ACTION), torch.nn.Linear(10, 1)
+
+    def forward(self, state, action):
+        return self.out(self.norm(torch.cat([state, action], 1)))
+
+
+def test_a_single_critic_may_be_any_module():
+    actor, normed = Actor(STATE, ACTION, in_keys=["state"]), Normed()
+    critic = TensorDictModule(normed, ["state", "action"], ["state_action_value"])
+    loss, batch = DDPGLoss(actor, critic, actor_clone := copy.deepcopy(actor)), make_batch(10)
+    batch["imitation"] = batch.select("state", "action")
+    after = batch["next", "state"]
+    best = torch.stack(
+        [
+            copy.deepcopy(normed)(after, one(TensorDict(state=after, batch_size=[10]))["action"])
+            for one in (actor, actor_clone)
+        ]
+    ).amax(0)
+    followed = batch["next", "reward"] + RLConfig.gamma * ~batch["next", "terminated"] * best
+    torch.testing.assert_close(loss(batch)["target_value"], followed.detach().squeeze(-1))
+
+
+def test_parameters_are_drawn_anew_and_estimators_of_trajectories_refused():
+    loss = make_loss("ddpg")
+    before = [parameter.clone() for parameter in loss.parameters()]
+    loss.reset_parameters_recursive()
+    assert not any(map(torch.equal, before, loss.parameters()))
+    with pytest.raises(NotImplementedError, match="TDLambdaEstimator needs whole trajectories"):
+        loss.make_value_estimator(TDLambdaEstimator, gamma=0.9, lmbda=0.9)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from bgpo_trl.scenes import Outcome, RobotEnv, StateColumns, find_scene
 from bgpo_trl.scenes.check import check_scene
@@ -96,11 +97,23 @@ class Redrawn(SavedDot):
 
 
 class Alias(SavedDot):
-    """Saves an array that it goes on changing."""
+    """Saves a tensor that it goes on changing."""
 
     def reset(self, task):
         super().reset(task)
-        self.place = np.array(self.place)
+        self.place = torch.tensor(self.place)
+
+    def frame(self):
+        place, self.place = self.place, float(self.place)
+        shown, self.place = super().frame(), place
+        return shown
+
+
+class Unsavable(SavedDot):
+    """Saves what no checkpoint can hold."""
+
+    def save(self):
+        return super().save() | {"place": np.array(self.place)}
 
 
 ALWAYS = "begin with the same frame "
@@ -119,6 +132,7 @@ ALWAYS = "begin with the same frame "
         (Misplaced, ["differently after load()"]),
         (Redrawn, ["differently after load()"]),
         (Alias, ["differently after load()"]),
+        (Unsavable, ["runs could not be saved: save()['place'] is a ndarray"]),
         (
             SolvedByTheSecondStep,
             [f"'{task}' succeeds by actions of 0 alone" for task in ("left", "right")],

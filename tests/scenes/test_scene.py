@@ -389,3 +389,9 @@ def test_a_run_whose_simulation_cannot_be_saved_is_not_resumed(pretrained, dot, 
         finish(trainer_of(tmp_path, pretrained, run_config(episodes=2)))
     again = partial(trainer_of, tmp_path, pretrained, resume=True)
     refused(again, "simulations of the scene 'dot' cannot be saved", "begin another")
+
+
+def test_all_tasks_are_those_that_it_has_unless_it_says_which():
+    robot = scene(default_tasks=("left",))
+    assert robot.all_tasks == ("left", "right")
+    assert replace(robot, own_tasks=("right",)).all_tasks == ("right",)

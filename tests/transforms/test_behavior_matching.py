@@ -1,7 +1,10 @@
 """BehaviorMatchingReward: the trajectory's embedding and the intrinsic reward at its end."""
 
+import math
+
 import pytest
 import torch
+from torchrl.data import Unbounded
 from torchrl.envs import (
     Compose,
     RenameTransform,
@@ -107,3 +110,40 @@ def test_rows_that_are_not_stepped_keep_their_embedding():
     for key in ("lae_h", "lae_c"):
         assert not after[key][0].equal(before[key][0])
         assert after[key][1].equal(before[key][1])
+
+
+class Silenced(MockEnv):
+    """Pays whole numbers, or hides the last latent of an episode, as one that resets itself."""
+
+    def __init__(self, reward):
+        super().__init__(lengths=2)
+        self.reward = reward
+        self.observation_spec["latent"] = Unbounded(64)
+        if reward == torch.int64:
+            self.reward_spec = Unbounded(1, dtype=torch.int64)
+
+    def _observe(self, action):
+        hidden = self.steps >= self.lengths and self.reward == torch.float32
+        return super()._observe(action).set("latent", torch.full([64], math.nan if hidden else 0.5))
+
+    def _step(self, tensordict):
+        data = super()._step(tensordict)
+        return data.set("reward", data["reward"].to(self.reward))
+
+
+@pytest.mark.parametrize(
+    ("reward", "message"),
+    [
+        (torch.int64, r"rewards are torch\.int64: append DTypeCastTransform"),
+        (
+            torch.float32,
+            r"end of an episode is NaN or Inf, as .* resets itself",
+        ),
+    ],
+)
+def test_a_bonus_that_would_be_lost_is_refused(reward, message):
+    behavior = RenameTransform(["latent"], ["behavior"], create_copy=True)
+    bonus = BehaviorMatchingReward(SequenceAutoencoder(embedding_size=64))
+    env = TransformedEnv(Silenced(reward), Compose(StepCounter(50), behavior, bonus))
+    with pytest.raises(ValueError, match=message):
+        env.rollout(3)

@@ -7,7 +7,16 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, RewardSum, SerialEnv, StepCounter, TransformedEnv, check_env_specs
+from torchrl.envs import (
+    Compose,
+    FrameSkipTransform,
+    MultiAction,
+    RewardSum,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+    check_env_specs,
+)
 
 from bgpo_trl.transforms import DemonstrationSource, TaskSchedule
 from tests.transforms.environment import (
@@ -147,13 +156,36 @@ def test_bad_arguments_and_wrong_orders_are_refused():
         source(TensorDict(batch_size=[2]))
 
 
-def test_a_clone_counts_and_draws_by_itself():
+def test_an_environment_wrapped_twice_counts_and_draws_in_the_same_source():
+    """TorchRL puts a clone of the transform into the environment that it makes of the two."""
     env, source = make([3, 4])
-    env.rollout(7, break_when_any_done=False)
+    beside = copy.deepcopy(env)
+    wrapped = TransformedEnv(env, RewardSum())
+    source.seed_rows([7, 8])
+    drawn = wrapped.rollout(7, break_when_any_done=False)["demo_index"]
     assert source.episode.tolist() == [2, 2]
-    beside = TransformedEnv(MockEnv([3, 4], 3), env.transform.clone())
-    (clone,) = (t for t in beside.transform if isinstance(t, DemonstrationSource))
-    assert beside.rollout(3)["demo_index"].equal(copy.deepcopy(env).rollout(3)["demo_index"])
-    clone.seed_rows([7, 8])
-    assert clone.episode.tolist() == [0, 0]
-    assert source.episode.tolist() == [2, 2]
+    (alone,) = (t for t in beside.transform if isinstance(t, DemonstrationSource))
+    assert alone.episode.tolist() == [0, 0]  # a deep copy is one by itself
+    alone.seed_rows([7, 8])
+    assert beside.rollout(7, break_when_any_done=False)["demo_index"].equal(drawn)
+
+
+def test_embeddings_with_a_graph_are_constants():
+    bank = make_bank()
+    bank.embedding.requires_grad_()
+    source = DemonstrationSource(bank, CONCURRENT)
+    data = TransformedEnv(MockEnv(), Compose(StepCounter(50), source)).rollout(2)
+    assert not data["demo_embedding"].requires_grad
+
+
+def test_every_step_is_seen_once():
+    def reset(*transforms):
+        TransformedEnv(MockEnv(), Compose(StepCounter(50), *transforms)).reset()
+
+    source = make_source()
+    with pytest.raises(ValueError, match="put FrameSkipTransform before DemonstrationSource"):
+        reset(source, FrameSkipTransform(2))
+    with pytest.raises(ValueError, match="put MultiAction after DemonstrationSource"):
+        reset(MultiAction(), make_source())
+    reset(FrameSkipTransform(2), make_source())
+    reset(make_source(), MultiAction())
