@@ -97,9 +97,10 @@ class Evaluator:
         self._rows_of = [torch.nonzero(bank.task == task).flatten() for task in range(n_tasks)]
         missing = [task for task, rows in enumerate(self._rows_of) if not len(rows)]
         if missing:
+            task = config.tasks[missing[0]]
             raise ValueError(
-                f"the bank has no held-out demonstration of task {missing[0]}: hold some out of "
-                "each task"
+                f"the bank has no held-out demonstration of {task!r}: hold some out of each task "
+                "(held_out_per_task), and embed them anew"
             )
         self._bank = bank
         self.simulation = scene.simulate(

@@ -213,7 +213,7 @@ def test_only_tasks_that_were_presented_are_tested(make, starts):
 def test_a_bank_without_a_held_out_demonstration_of_a_task_is_refused(bank, encoders, make_config):
     train = bank.train | (bank.task == 1)
     incomplete = DemonstrationBank(bank.embedding, bank.task, train, bank.tasks).held_out()
-    with pytest.raises(ValueError, match="no held-out demonstration of task 1"):
+    with pytest.raises(ValueError, match=f"no held-out demonstration of {nico.PAPER_TASKS[1]!r}"):
         Evaluator(make_config(), incomplete, encoders, episodes=1)
 
 

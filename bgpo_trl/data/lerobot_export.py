@@ -64,6 +64,8 @@ def write_lerobot(
             is not positive.
         OSError: If a file cannot be written; nothing is left.
     """
+    if dataset.ndim != 1:
+        raise ValueError("give a batch of demonstrations, of a single one dataset[:1]")
     if fps < 1 or not len(dataset):
         raise ValueError(
             f"there are {len(dataset)} demonstrations at {fps} frames per second: give at least 1"

@@ -120,6 +120,13 @@ def test_long_datasets_are_spread_over_several_files(tmp_path, monkeypatch):
     assert [len(e["pixels"]) for e in read_lerobot(path)[TASKS[1]]] == [5, 4]
 
 
+def test_no_demonstrations_and_one_without_a_batch_are_not_written(tmp_path, refused):
+    for part, remedy in ((slice(0), "at least 1"), (0, "dataset[:1]")):
+        write = partial(write_lerobot, tmp_path / "no", dataset_of()[part], tasks=TASKS, fps=5)
+        refused(write, "demonstrations", remedy)
+    assert not (tmp_path / "no").exists()
+
+
 def test_frames_of_another_size_are_resized_if_asked(written):
     found = read_lerobot(written, frame_shape=(16, 32))[TASKS[0]][0]["pixels"]
     np.testing.assert_array_equal(found, resize_frames(dataset_of()["pixels"][1, :2], (16, 32)))
