@@ -29,7 +29,8 @@ class BehaviorMatchingReward(EpisodeTransform):
     3. The intrinsic reward is ``exp(-||b - phi_g||)`` on the step that ends the episode, by success
        or by time-out, and 0 on all others. The reward becomes extrinsic + beta * intrinsic.
 
-    Put it after ``StepCounter`` and before ``RewardSum``.
+    Put it after ``StepCounter`` and before ``RewardSum``. TorchRL's ``NoopResetEnv`` and
+    ``TargetReturn``, which expect one reward, come before it.
 
     Reads ``latent`` float32 ``[*B, 64]``, ``behavior`` float32 ``[*B, 32]``, ``reward`` ``[*B, 1]``
     and ``done``; writes ``lae_h`` and ``lae_c`` float32 ``[*B, 32]``, ``extrinsic_reward``,
