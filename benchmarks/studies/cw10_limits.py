@@ -203,10 +203,10 @@ def print_groups(dataset: TensorDictBase, encode: Callable[[Tensor], Tensor]) ->
 
 @dataclass(frozen=True)
 class Arguments:
-    """What limits clones and groups."""
+    """Choose what to measure of clones and groups, and on which tasks."""
 
     what: tyro.conf.Positional[Literal["truth", "frames", "groups", "replay"]]
-    """What clones observe, or groups, or the replay of actions."""
+    """Measure clones of the ground truth or of frames, groups, or the replay of actions."""
     folder: Path = Path("runs/cw10/demonstrations")
     """Folder of the demonstrations."""
     tasks: tuple[str, ...] = CW10

@@ -91,10 +91,13 @@ class DemonstrationReplay:
     def add(
         self, episode: TensorDictBase, reward: Tensor, group: Tensor, mask: Tensor | None = None
     ) -> None:
-        """Store the demonstration of an episode of each seed; see `GroupReplay.add`.
+        """Store the demonstration of an episode of each seed.
 
-        ``episode`` has ``"demo_index"`` int64 and the constant entries, ``reward`` float32 ``[S]``
-        is that of the demonstration's last transition.
+        Args:
+            episode: Batch size ``[S]``, with ``"demo_index"`` int64 and the constant entries.
+            reward: Reward of the demonstration's last transition, float32 ``[S]``.
+            group: Group of each demonstration, int64 ``[S]``.
+            mask: Seeds that store theirs, bool ``[S]``; ``None`` for all.
         """
         self._shown.add(episode.copy().set("reward", reward), group, mask)
 

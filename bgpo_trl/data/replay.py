@@ -290,7 +290,11 @@ class GroupReplay:
         return entries, entries.pop(_GROUP)
 
     def regroup(self, seed: int, group: Tensor) -> None:
-        """Assign the transitions of a seed to groups anew, int64 ``[number of sources]``.
+        """Assign the transitions of a seed to groups anew.
+
+        Args:
+            seed: Position of the seed.
+            group: Group of the transitions of each source, int64 ``[number of sources]``.
 
         Raises:
             ValueError: If the replay has no ``source_key``.

@@ -97,7 +97,7 @@ class BehaviorMatchingReward(EpisodeTransform):
                 next_tensordict.set(key, torch.where(rows, next_tensordict.get(key), before))
         extrinsic = next_tensordict.get("reward")
         if not extrinsic.is_floating_point():  # in which the intrinsic reward would be 0
-            raise ValueError(f"rewards are {extrinsic.dtype}: append DTypeCastTransform before")
+            raise ValueError(f"rewards are {extrinsic.dtype}: put DTypeCastTransform before this")
         intrinsic = torch.zeros_like(extrinsic)
         ended = ending(tensordict, next_tensordict)
         if ended.any():

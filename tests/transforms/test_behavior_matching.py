@@ -134,7 +134,7 @@ class Silenced(MockEnv):
 @pytest.mark.parametrize(
     ("reward", "message"),
     [
-        (torch.int64, r"rewards are torch\.int64: append DTypeCastTransform"),
+        (torch.int64, r"rewards are torch\.int64: put DTypeCastTransform before"),
         (
             torch.float32,
             r"end of an episode is NaN or Inf, as .* resets itself",
