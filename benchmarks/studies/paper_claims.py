@@ -20,14 +20,14 @@ import numpy as np
 import tyro
 
 from bgpo_trl.analysis import statistics
-from bgpo_trl.analysis.comparison import check_conditions
+from bgpo_trl.analysis.comparison import check_conditions, joined
 from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.evaluation import evaluate_random_policy
 from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import plot_success_curves
 from bgpo_trl.files.writing import write_whole
-from bgpo_trl.runs.results import Run, joined, read_run, run_directories
+from bgpo_trl.runs.results import Run, read_run, run_directories
 
 N_RANDOM = 300
 

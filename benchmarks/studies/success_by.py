@@ -17,13 +17,13 @@ from numpy.typing import ArrayLike
 from shared import style_success
 
 from bgpo_trl.analysis import statistics
-from bgpo_trl.analysis.comparison import check_conditions, title_of
+from bgpo_trl.analysis.comparison import check_conditions, joined, title_of
 from bgpo_trl.analysis.scores import late_scores
 from bgpo_trl.analysis.tables import Section, Table
 from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.experiments.report import write_sections
 from bgpo_trl.figures.style import COLORS, LINES, MARKERS, readable
-from bgpo_trl.runs.results import Run, joined, read_run, run_directories
+from bgpo_trl.runs.results import Run, read_run, run_directories
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def success_by(arguments: ByArguments) -> str:
     Raises:
         ValueError: If a run is damaged or not finished, or runs differ in anything else.
     """
-    if not arguments.runs or (arguments.out is None and len(arguments.runs) > 1):
+    if not (arguments.out and arguments.runs) and len(arguments.runs) != 1:
         raise ValueError("name a folder of runs, or several and --out")
     runs = runs_by(run_directories(arguments.runs), arguments.by)
     return write_sections([section_by(runs, arguments.by)], arguments.out or arguments.runs[0])

@@ -9,7 +9,11 @@ from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
 
-from bgpo_trl.runs.results import OF_KEEPING, Run, joined, read_run
+import pandas as pd
+
+from bgpo_trl.runs.directory import differing_settings
+from bgpo_trl.runs.provenance import each_once
+from bgpo_trl.runs.results import OF_KEEPING, OF_SEEDS, Run, read_run
 
 NAMES = {
     "bgpo": "BGPO",
@@ -106,6 +110,58 @@ class Setting:
             return run.algorithm, run.changed, run.config.get("algorithm")
 
         return next((run for run in self.runs.values() if settings(run) == settings(like)), None)
+
+
+def joined(runs: Iterable[Run]) -> list[Run]:
+    """Return runs, of which those that differ only in their seeds are one.
+
+    Runs that share a seed, or were tested at other times, stay apart. A hyperparameter that only
+    one run's settings name, since it came with a later version, is passed over, unless it is
+    `changed` there.
+    """
+    groups: list[list[Run]] = []
+    for run in runs:
+        group = next((group for group in groups if _alike(group[0], run)), None)
+        if group is None:
+            groups.append([run])
+        else:
+            group.append(run)
+    found: list[Run] = []
+    for parts in groups:
+        seeds = [seed for run in parts for seed in run.seeds]
+        tests = {tuple(run.episodes.tolist()) for run in parts}
+        found += [_joined(parts)] if len(tests) == 1 and len({*seeds}) == len(seeds) else parts
+    return found
+
+
+def _alike(run: Run, other: Run) -> bool:
+    """Return whether two runs differ in their seeds alone."""
+    differing = (
+        name
+        for name, *values in differing_settings(run.config, other.config)
+        if name not in OF_KEEPING and not (name.startswith("algorithm.") and "absent" in values)
+    )
+    return run.changed == other.changed and not any(differing)
+
+
+def _joined(parts: list[Run]) -> Run:
+    """Return runs of different seeds as one."""
+    if len(parts) == 1:
+        return parts[0]
+    parts = sorted(parts, key=lambda run: run.seeds)
+    first, summary = parts[0], dict(parts[0].summary)
+    for key in OF_SEEDS:
+        values = [run.summary.get(key) for run in parts]
+        summary[key] = None if None in values else [v for of_run in values for v in of_run or ()]
+    for key in ("commit", "command"):
+        summary[key] = each_once(run.summary.get(key) or "" for run in parts)
+    tables: dict[str, Any] = {}
+    for name in ("tests", "training", "final", "costs"):
+        of_runs = [getattr(run, name) for run in parts]
+        lacking = any(table is None for table in of_runs)
+        tables[name] = None if lacking else pd.concat(of_runs, ignore_index=True)
+    config = {**first.config, "seeds": [seed for run in parts for seed in run.seeds]}
+    return Run(tuple(run.directory for run in parts), config, summary, **tables)
 
 
 def read_settings(directories: Sequence[Path]) -> tuple[list[Setting], str]:

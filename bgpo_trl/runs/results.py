@@ -22,7 +22,6 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from bgpo_trl.files.writing import make_folder, write_whole
-from bgpo_trl.runs.provenance import each_once
 
 _EPISODE = ("algorithm", "seed", "episode", "env_steps", "task", "success", "return", "steps")
 _OF_TRAINING = ("intrinsic_return", "num_nodes", "group", "num_groups", "loss_actor", "loss_value")
@@ -144,7 +143,7 @@ def read_json(
 # Entries of config.json that belong to keeping a run, not to what it is.
 OF_KEEPING = ("seeds", "checkpoint_minutes", "task_modules")
 # Entries of summary.json, a value per seed.
-_OF_SEEDS = ("learned_episodes", "nodes", "groups", "group_purity")
+OF_SEEDS = ("learned_episodes", "nodes", "groups", "group_purity")
 
 
 @dataclass(frozen=True, eq=False)  # Tables have no truth value.
@@ -281,7 +280,7 @@ def read_run(directory: str | os.PathLike[str]) -> Run:
             f"{directory / 'config.json'} has the seeds {seeds}: name whole numbers, each once"
         )
     path = directory / "summary.json"
-    lists: dict[str, Any] = dict.fromkeys(_OF_SEEDS, list | None)
+    lists: dict[str, Any] = dict.fromkeys(OF_SEEDS, list | None)
     maps: dict[str, Any] = dict.fromkeys(("changed", "demonstrated_steps"), dict | None)
     summary = read_json(path, lists | maps) if path.exists() else {}
     tables = {
@@ -319,44 +318,6 @@ def is_finished(directory: Path, episodes: int) -> bool:
     if not (path.exists() and (directory / "final.csv").exists()):
         return False
     return read_json(path).get("episodes") == episodes
-
-
-def joined(runs: Iterable[Run]) -> list[Run]:
-    """Return runs, of which those that differ only in their seeds are one.
-
-    Runs that share a seed, or were tested at other times, stay apart.
-    """
-    groups: dict[str, list[Run]] = {}
-    for run in runs:
-        alike = {name: run.config[name] for name in run.config if name not in OF_KEEPING}
-        key = json.dumps([alike, run.changed], sort_keys=True)
-        groups.setdefault(key, []).append(run)
-    found: list[Run] = []
-    for parts in groups.values():
-        seeds = [seed for run in parts for seed in run.seeds]
-        tests = {tuple(run.episodes.tolist()) for run in parts}
-        found += [_joined(parts)] if len(tests) == 1 and len({*seeds}) == len(seeds) else parts
-    return found
-
-
-def _joined(parts: list[Run]) -> Run:
-    """Return runs of different seeds as one."""
-    if len(parts) == 1:
-        return parts[0]
-    parts = sorted(parts, key=lambda run: run.seeds)
-    first, summary = parts[0], dict(parts[0].summary)
-    for key in _OF_SEEDS:
-        values = [run.summary.get(key) for run in parts]
-        summary[key] = None if None in values else [v for of_run in values for v in of_run or ()]
-    for key in ("commit", "command"):
-        summary[key] = each_once(run.summary.get(key) or "" for run in parts)
-    tables: dict[str, Any] = {}
-    for name in ("tests", "training", "final", "costs"):
-        of_runs = [getattr(run, name) for run in parts]
-        lacking = any(table is None for table in of_runs)
-        tables[name] = None if lacking else pd.concat(of_runs, ignore_index=True)
-    config = {**first.config, "seeds": [seed for run in parts for seed in run.seeds]}
-    return Run(tuple(run.directory for run in parts), config, summary, **tables)
 
 
 def run_directories(paths: Iterable[Path]) -> list[Path]:

@@ -1,8 +1,10 @@
 """Which runs are compared, and which are not."""
 
+from dataclasses import replace
+
 import pytest
 
-from bgpo_trl.analysis.comparison import check_conditions, read_settings, reference_of
+from bgpo_trl.analysis.comparison import check_conditions, joined, read_settings, reference_of
 from bgpo_trl.runs.results import read_run, run_directories
 from tests.analysis.runs import HEAD, TASKS, write_run
 from tests.helpers import edit
@@ -81,6 +83,27 @@ def test_all_runs_are_compared_with_each_other(tmp_path, refused):
     write_run(tmp_path, "oracle", 5, spread=1.0)
     write_run(tmp_path, "maml", 5, spread=0.25)
     refused(lambda: settings_in(tmp_path), "differ in spread (", "only runs")
+
+
+@pytest.mark.parametrize(
+    ("settings", "changed", "number"),
+    [
+        ({}, {}, 1),
+        ({"algorithm": {"max_steps": 50, "pace": 1.0}}, {}, 1),  # a setting that came later
+        ({"algorithm": {"max_steps": 50, "pace": 1.5}}, {"pace": 1.5}, 2),
+        ({"algorithm": {"max_steps": 30}}, {}, 2),
+        ({"demonstrations": 30}, {}, 2),
+    ],
+)
+def test_runs_that_differ_in_their_seeds_alone_are_joined(tmp_path, settings, changed, number):
+    first = read_run(write_run(tmp_path, "bgpo", [5]))
+    config = {**first.config, "seeds": [1], **settings}
+    other = replace(first, config=config, summary={**first.summary, "changed": changed})
+    for runs in ([first, other], [other, first]):
+        found = joined(runs)
+        assert len(found) == number
+        assert sorted(seed for run in found for seed in run.seeds) == [0, 1]
+        assert found[0].changed == runs[0].changed
 
 
 def test_seeds_and_algorithms_are_not_conditions(tmp_path):
