@@ -27,6 +27,11 @@ class TaskAlgorithm(Algorithm):
 
     def __init__(self, config: TaskConfig, **arguments: Any) -> None:
         super().__init__(config, **arguments)
+        if config.share_batch and config.task_batch_size < 2 * self.n_tasks:
+            raise ValueError(
+                f"task_batch_size must be at least {2 * self.n_tasks} where {self.n_tasks} tasks "
+                f"share it, so that each has an even number, got {config.task_batch_size}"
+            )
         self.spec = LearnerSpec(
             seeds=self.seeds,
             in_keys=[config.observed],

@@ -118,5 +118,12 @@ def test_a_replay_too_small_to_fill_a_batch_is_refused(make_task_algorithm, make
 
 
 @both
+def test_a_batch_too_small_to_share_is_refused(make_task_algorithm, name):
+    make_task_algorithm(name, task_batch_size=6, share_batch=True)
+    with pytest.raises(ValueError, match=r"at least 6 where 3 tasks share it, .* got 4"):
+        make_task_algorithm(name, task_batch_size=4, share_batch=True)
+
+
+@both
 def test_targets_are_clipped_to_the_attainable_returns(make_task_algorithm, name):
     assert make_task_algorithm(name).learner.loss.return_bounds == (0.0, 1.0)
