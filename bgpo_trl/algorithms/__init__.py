@@ -108,8 +108,8 @@ ABLATIONS = (
     "bgpo",
 )
 """The arms of the paper's ablation (Fig. 9), of ``bgpo-single``: with GWR-B and the intrinsic
-reward, one of them, neither. Then each addition of this package to the published algorithm, and all of
-them. Fig. 9 as published is ``bgpo-paper`` with ``context="embedding"`` and ``beta=0``."""
+reward, one of them, neither. Then each addition of this package, and all of them together. Fig. 9
+as published is ``bgpo-paper`` with ``context="embedding"`` and ``beta=0``."""
 
 
 def entry(name: str) -> Entry:
