@@ -173,7 +173,9 @@ def doubt_frames(network: FrameNetwork, frames: Tensor) -> str:
     best = min(errors, key=errors.__getitem__)
     usual = network.decode(network.latent_mean.unsqueeze(0))
     apart = float((changed[best] / 255 - usual).square().mean())
-    # A network that reconstructs neither tells nothing; in doubt, frames are as they should be.
-    if errors[best] >= min(0.9 * error(frames), 0.5 * apart):
+    # A network that reconstructs neither tells nothing, unless one is reconstructed far better; in
+    # doubt, frames are as they should be.
+    unchanged = error(frames)
+    if errors[best] >= min(0.9 * unchanged, max(0.5 * apart, 0.6 * unchanged)):
         return ""
     return f"frames fit the encoders better {best}: {_CHANGES[best][1]}"

@@ -54,7 +54,9 @@ def test_ridge_regression_finds_a_linear_map_at_any_scale() -> None:
     torch.testing.assert_close(predicted, truth(x_new), rtol=1e-3, atol=1e-3)
 
 
-def test_demonstrations_unlike_those_of_the_encoders_are_told(tmp_path: Path) -> None:
+def test_demonstrations_unlike_those_of_the_encoders_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     recording = {"per_task": 2, "held_out_per_task": 1, "seed": 9, "progress": False}
     dataset = record_demonstrations(tmp_path / "shown", **recording)
     encoders = load_pretrained()[0]
@@ -70,7 +72,7 @@ def test_demonstrations_unlike_those_of_the_encoders_are_told(tmp_path: Path) ->
         (action * torch.tensor([1.0, -1.0, 1.0, 1.0]), "component 1 .* opposite sign"),
         (
             action[..., [1, 0, 2, 3]],
-            "component 0 \(from 0\) of recorded actions moves what component 1 moved",
+            r"component 0 \(from 0\) of recorded actions moves what component 1 moved",
         ),
         (action + torch.tensor([0.0, 0.0, 0.3, 0.0]), r"component 2 .* is \+0.\d+ off"),
         (torch.rand_like(action) - 0.5, "little to do with what frames show"),
@@ -96,6 +98,16 @@ def test_demonstrations_unlike_those_of_the_encoders_are_told(tmp_path: Path) ->
     blue = dataset.clone().update({"pixels": dataset["pixels"].flip(-1)}).exclude("action")
     with pytest.warns(UserWarning, match="better with red and blue exchanged"):
         make_bank(encoders, blue, tasks=NICO.default_tasks)
+    # A poor encoder, whose errors are half as large as that of the mean frame or larger.
+    noise = 0.12 * torch.randn(32, 64, 3, generator=torch.Generator().manual_seed(0))
+    decode = network.decode
+    monkeypatch.setattr(network, "decode", lambda z: decode(z) + noise)
+    with torch.no_grad():
+        usual = network.decode(network.latent_mean.unsqueeze(0))
+        own = network.decode(network.encode(shown)[0])
+    assert (wide / 255 - own).square().mean() > 0.5 * (wide / 255 - usual).square().mean()
+    assert doubt_frames(network, shown) == ""
+    assert "give them red first" in doubt_frames(network, shown.flip(-1))
 
 
 class Blind(FrameNetwork):
