@@ -154,13 +154,25 @@ class Learner:
         """Return the losses ``[S, E]`` to minimize on transitions ``[S, E, B]``.
 
         That of the actor is due in one of ``policy_delay`` updates.
+
+        Raises:
+            RuntimeError: If the loss has not counted the update.
         """
         if self.config.proposals == "clone":
             return {"loss_clone": self.loss.loss_clone(batch)}
-        if (int(self.loss.n_calls) + 1) % self.config.policy_delay:
+        n_calls = int(self.loss.n_calls)
+        if (n_calls + 1) % self.config.policy_delay:
             clone = {"loss_clone": self.loss.loss_clone(batch)} if self.loss.has_clone else {}
-            return {"loss_value": self.loss.loss_value(batch)[0], **clone}
-        return {str(k): v for k, v in self.loss(batch).items() if str(k).startswith("loss_")}
+            losses = {"loss_value": self.loss.loss_value(batch)[0], **clone}
+        else:
+            every = self.loss(batch).items()
+            losses = {str(k): v for k, v in every if str(k).startswith("loss_")}
+        if int(self.loss.n_calls) == n_calls:  # or the actor would never learn
+            raise RuntimeError(
+                f"{type(self.loss).__name__}.loss_value must call self.target once in an update, "
+                "or add 1 to self.n_calls"
+            )
+        return losses
 
     def begin_anew(self, index: int) -> None:
         """Let the networks of one seed, given its position, begin another task.

@@ -270,7 +270,6 @@ class DDPGLoss(LossModule):
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Compute the critics' loss, reduced, and further entries; write ``"td_error"``."""
-        self.n_calls += 1
         with torch.no_grad():
             target = self.target(tensordict)
         data = self._select(tensordict, self.value_network.in_keys)
@@ -293,10 +292,13 @@ class DDPGLoss(LossModule):
     def target(self, tensordict: TensorDictBase) -> Tensor:
         """Return the clipped bootstrapped targets of transitions, ``[*S, *B]``.
 
+        Each call is the turn of another `pair` of critics, and counts as an update (`n_calls`).
+
         Raises:
             ValueError: If the reward has another shape, or transitions are of TorchRL's
                 ``MultiStep``.
         """
+        self.n_calls += 1
         if "nonterminal" in tensordict:  # which MultiStep writes
             raise ValueError(
                 "TorchRL's MultiStep leaves 'terminated' of the first step, by which targets would "

@@ -52,6 +52,29 @@ def test_every_update_is_one_of_critics_and_clone_and_every_other_one_of_the_act
         assert all(value.shape == (2,) for value in told.values())
 
 
+def test_a_critic_loss_of_ones_own_leaves_the_actor_and_the_pairs_their_turns(monkeypatch):
+    learner, pairs = make("both"), []
+    loss = learner.loss
+
+    def huber(batch):
+        with torch.no_grad():
+            target = loss.target(batch)
+        pairs.append(loss.pair)
+        values = loss.values("value_network", batch)
+        distance = torch.nn.functional.smooth_l1_loss(values, target.unsqueeze(2).expand_as(values))
+        return distance.expand(2, 1), {}
+
+    monkeypatch.setattr(loss, "loss_value", huber)
+    for update in range(1, 11):
+        before = weights(learner)
+        learner.learn(make_batch(2, 1, 16, seed=update))
+        assert any(key[0] == "a" for key in changed(before, weights(learner))) == (update % 2 == 0)
+    assert len({*pairs}) == 10
+    monkeypatch.setattr(loss, "loss_value", lambda batch: (torch.zeros(2, 1), {}))
+    with pytest.raises(RuntimeError, match=r"loss_value must call self\.target once"):
+        learner.learn(make_batch(2, 1, 16))
+
+
 @every_kind
 def test_each_expert_learns_as_it_would_alone_whatever_the_others_see(name):
     """Of one seed: experts are as independent of each other as seeds are."""
