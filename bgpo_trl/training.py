@@ -32,7 +32,14 @@ from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.cost import CostLog
 from bgpo_trl.runs.dashboard import Dashboard
 from bgpo_trl.runs.demonstrations import keep_inputs
-from bgpo_trl.runs.directory import digest_of_logged, fitting_checkpoint, load_last, open_tables
+from bgpo_trl.runs.directory import (
+    digest_of_logged,
+    fitting_checkpoint,
+    load_last,
+    open_tables,
+    put_back_costs,
+    replacing_costs,
+)
 from bgpo_trl.runs.provenance import command, commit_of_code
 from bgpo_trl.scenes import find_scene
 from bgpo_trl.seeding import generators
@@ -160,6 +167,8 @@ class Trainer:
                     self._load(saved)
                 if encoders is not None:  # before config.json names tasks that may be added
                     keep_inputs(self.directory, bank, encoders, self._scene)
+            if saved is not None:
+                put_back_costs(self.directory, self.env_steps)
             self._cost = CostLog(self.directory / "cost.csv", resume=saved is not None)
             self.tables = opened.enter_context(
                 open_tables(
@@ -356,6 +365,14 @@ class Trainer:
         intrinsic = end.get("episode_intrinsic_reward", 0.0)  # not measured in every variant
         pays = "episode_extrinsic_reward" in end
         extrinsic = end["episode_extrinsic_reward" if pays else "episode_reward"]
+        task = self.config.tasks[int(end["task"])]
+        # Demonstrations that are replayed pay 1 at their end, too.
+        if self.config.algorithm.rl.clip_targets and not 0 <= float(extrinsic) <= 1:
+            raise ValueError(
+                f"an episode of {task} has a return of {float(extrinsic):.4g}, but values are "
+                "clipped to those of a reward of 1 on success and 0 before: give this reward, or "
+                "set rl.clip_targets to False"
+            )
         nodes = 0 if algorithm.gwr is None else int(algorithm.gwr.num_nodes[index])
         groups = len(algorithm.groups[index].numbers) if algorithm.groups else 1
         row = {
@@ -363,7 +380,7 @@ class Trainer:
             "seed": self.config.seeds[index],
             "episode": episode,
             "env_steps": self.env_steps,
-            "task": self.config.tasks[int(end["task"])],
+            "task": task,
             "success": int(end["success"]),
             "return": float(extrinsic),
             "steps": int(end["step_count"]),
@@ -440,9 +457,10 @@ class Trainer:
             "settings": self._settings,
             "position": {name: table.position() for name, table in self.tables.items()},
         }
-        save_checkpoint(self.directory / "checkpoint", state)
         self._cost.measure(self._n_tasks, state["algorithm"])
-        self._cost.write()
+        with replacing_costs(self.directory):
+            self._cost.write()
+            save_checkpoint(self.directory / "checkpoint", state)
 
     def _load(self, state: dict[str, Any]) -> None:
         self.world.load_state_dict(state["world"])

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from torchrl.envs import RewardScaling, TransformedEnv
 
 from bgpo_trl import training
 from bgpo_trl.algorithms.algorithm import Policy
@@ -219,6 +220,23 @@ def test_wrong_results_of_an_algorithm_are_refused(
     monkeypatch.setattr(BGPO, method, staticmethod(wrong))
     with pytest.raises(TypeError, match=r"BGPO must (return|be)"):
         begin(tmp_path, make_config("state", "ddpg", episodes=2)).run()
+
+
+def test_returns_that_clipped_values_cannot_reach_are_refused(
+    begin, make_config, tmp_path, monkeypatch
+):
+    config = make_config("state", "ddpg", episodes=2)
+    make_env = BGPO.make_env
+
+    def costly(self, env, source):
+        return make_env(self, TransformedEnv(env, RewardScaling(-1.0, 1.0)), source)
+
+    monkeypatch.setattr(BGPO, "make_env", costly)
+    with pytest.raises(ValueError, match=r"an episode of .* has a return of -\d+, but values"):
+        begin(tmp_path / "clipped", config).run()
+    rl = replace(config.algorithm.rl, clip_targets=False)
+    finish(begin(tmp_path / "free", replace(config, algorithm=replace(config.algorithm, rl=rl))))
+    assert min(float(row["return"]) for row in rows(tmp_path / "free" / "train.csv")) < -1
 
 
 @pytest.mark.parametrize("name", [*DISTINCT, "clone"])
