@@ -19,6 +19,7 @@ class NearestNeighbors(Algorithm):
     """k nearest neighbors (Pari et al., 2021): states ``[M, 96]`` with actions ``[M, 4]``."""
 
     conditioning = (RenameTransform(["demo_embedding"], ["context"], create_copy=True),)
+    needs_label = False
 
     def __init__(self, config, *, states, actions, **others):
         super().__init__(config, **others)

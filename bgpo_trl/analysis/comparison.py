@@ -273,7 +273,8 @@ def check_conditions(run: Run, other: Run, ignored: Sequence[str] = ()) -> None:
 
 def _conditions(run: Run) -> dict[str, Any]:
     algorithm = run.config.get("algorithm")
-    known = {k: v for k, v in run.config.items() if k not in _OF_THE_RUN}
+    # Stored only by runs that began with logged episodes.
+    known = {"logged": None} | {k: v for k, v in run.config.items() if k not in _OF_THE_RUN}
     if isinstance(algorithm, dict) and "max_steps" in algorithm:
         known["max_steps"] = algorithm["max_steps"]
     return known

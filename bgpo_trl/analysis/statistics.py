@@ -24,7 +24,7 @@ _PERMUTATIONS = 20_000
 
 
 class Estimate(NamedTuple):
-    """A value with its interval; NaN bounds if a sample has a single seed."""
+    """A value with its interval; NaN bounds if samples do not tell their spread."""
 
     value: float
     low: float
@@ -52,7 +52,8 @@ def contrast(
 ) -> Estimate:
     """Return the mean of a sample ``[S]``, or that minus the mean of another, with its t interval.
 
-    The degrees of freedom are by Welch and Satterthwaite.
+    The degrees of freedom are by Welch and Satterthwaite. Equal scores do not tell the spread, so
+    samples of such alone have no interval.
 
     Raises:
         ValueError: If a sample is empty, not finite or not a vector.
@@ -67,6 +68,8 @@ def contrast(
             value = first.mean() - second.mean()
             test = stats.ttest_ind(first, second, equal_var=False)
         low, high = test.confidence_interval(confidence)
+    if not any(np.ptp(scores) for scores in (first, second) if scores is not None):
+        low = high = math.nan
     return Estimate(float(value), float(low), float(high))
 
 

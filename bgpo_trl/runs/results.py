@@ -253,7 +253,7 @@ class Run:
             return f"has tests until episode {self.last} of {episodes}"
         # Its hyperparameters are not told yet, and its last tests may be written in part.
         if not self.summary and (self.directory / "checkpoint").exists():
-            return "has no summary"
+            return "has no summary (run_experiment writes it, Trainer alone does not)"
         return ""
 
 

@@ -26,11 +26,13 @@ def test_a_difference_has_welchs_intervals():
         assert estimate == pytest.approx((value, value - half, value + half))
 
 
-def test_the_interval_of_equal_scores_is_a_point():
-    found = statistics.difference([0.9, 0.9], [0.8, 0.8, 0.8])
-    assert found.estimate == pytest.approx((0.1, 0.1, 0.1))
-    assert found.verdict == "above"
-    assert statistics.difference([0.5, 0.5], [0.5, 0.5]).verdict == "equivalent"
+def test_equal_scores_give_no_interval_and_no_verdict():
+    """But for a difference to scores that are not equal."""
+    for scores in ([0.8, 0.8, 0.8], [0.9, 0.9]):
+        found = statistics.difference([0.9, 0.9], scores)
+        assert np.isnan(found.estimate[1:]).all() and found.verdict == "not decided"
+    assert statistics.mean([0.9, 0.9]).percent() == "90.0"
+    assert statistics.difference([0.9, 0.9], [0.5, 0.501, 0.5]).verdict == "above"
 
 
 def test_a_single_seed_gives_no_interval_and_no_verdict():
