@@ -15,7 +15,7 @@ from bgpo_trl import training
 from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.encoders.pretrained import load_pretrained
-from bgpo_trl.files.checkpoint import load_checkpoint
+from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.runs.cost import n_bytes
 from bgpo_trl.runs.results import read_table
@@ -300,6 +300,38 @@ def test_a_run_that_fails_is_resumed_from_its_last_checkpoint(
     assert state["position"]["train.csv"] < (tmp_path / "train.csv").stat().st_size
     begin(tmp_path, resume=True).run()
     assert_same_run(tmp_path, uninterrupted)
+
+
+@pytest.mark.parametrize("last", ["", "cost.csv", "checkpoint"])
+def test_costs_are_those_of_the_checkpoint_after_kills_while_both_are_written(
+    begin, make_config, tmp_path, monkeypatch, last
+):
+    """Killed before or after ``last`` was written, twice."""
+    config = make_config("state", "ddpg", episodes=4)
+    interrupt(begin(tmp_path, config), 7)
+
+    def save_and_crash(*args):
+        save_checkpoint(*args)
+        crash()
+
+    def steps():
+        return read_table(tmp_path / "cost.csv")["steps"].sum()
+
+    for killed in (1, 2):
+        with monkeypatch.context() as patch:
+            if not last:
+                patch.setattr(training.CostLog, "write", crash)
+            patch.setattr(
+                training, "save_checkpoint", save_and_crash if last == "checkpoint" else crash
+            )
+            with pytest.raises(RuntimeError, match="a failure"):
+                interrupt(begin(tmp_path, config, resume=True), 4)
+        with begin(tmp_path, config, resume=True) as trainer:
+            assert trainer.env_steps == 7 + 4 * killed * (last == "checkpoint")
+            assert steps() == trainer.env_steps
+    trainer = finish(begin(tmp_path, config, resume=True))
+    assert steps() == trainer.env_steps
+    assert not (tmp_path / "checkpoint" / "cost.csv").exists()
 
 
 def test_a_second_signal_ends_the_run_at_once(begin, make_config, tmp_path):

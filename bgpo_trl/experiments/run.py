@@ -27,12 +27,14 @@ from bgpo_trl.experiments.settings import (
     named_directory,
     run_config,
 )
+from bgpo_trl.files.checkpoint import has_checkpoint
 from bgpo_trl.files.writing import lock_directory, write_json
+from bgpo_trl.logged import LoggedEpisodes
 from bgpo_trl.machine import choose_device, keep_freed_memory, set_threads
 from bgpo_trl.runs.config_file import Digests, read_config, read_encoder_settings
 from bgpo_trl.runs.dashboard import check_installed, tensorboard_logger, wandb_logger
 from bgpo_trl.runs.demonstrations import BANK, load_inputs, own_weights
-from bgpo_trl.runs.directory import holds_run
+from bgpo_trl.runs.directory import check_settings, holds_run
 from bgpo_trl.runs.growth import Grown, add_task, distinctness
 from bgpo_trl.runs.provenance import command, commit_of_code, versions
 from bgpo_trl.runs.results import is_finished
@@ -86,6 +88,7 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> str:
         if added in saved.tasks[-1:]:  # the same command once more; the run has the bank
             added, arguments = None, replace(arguments, bank=None)
         if added is None and saved == config and is_finished(out, config.episodes):
+            check_inputs(arguments, config, out, digests)
             return f"{out} is finished, all {config.episodes} episodes: --episodes makes it longer"
         _check_encoders(arguments, out, digests)
     loggers: list[Callable[[], Logger]] = []
@@ -170,6 +173,21 @@ def _check_encoders(arguments: Arguments, out: Path, digests: Digests) -> None:
         raise ValueError(f"--train-encoders: {out} was begun with encoders: leave the flag out")
 
 
+def check_inputs(arguments: Arguments, config: RunConfig, out: Path, digests: Digests) -> None:
+    """Raise ``ValueError`` if a run has other files than those named, or another scene version."""
+    _check_encoders(arguments, out, digests)
+    scene = find_scene(config.scene)
+    settings = {"scene_version": scene.full_version}
+    if arguments.bank is not None:
+        encoders, bank = pretrained_for(
+            config.tasks, arguments.bank, scene=scene, weights=arguments.encoders
+        )
+        settings |= {"encoders": encoders.identity, "bank": bank.identity}
+    if arguments.logged is not None:
+        settings["logged"] = LoggedEpisodes.load(arguments.logged).identity
+    check_settings(out, settings)
+
+
 def _repeated(
     arguments: Arguments, config: RunConfig
 ) -> tuple[Representation, DemonstrationBank] | None:
@@ -220,7 +238,16 @@ def _inputs(
     """Return encoders and a bank: those of a run that has begun, trained ones, or new ones."""
     scene, bank = find_scene(config.scene), arguments.bank
     if digests is not None and bank is None:
-        return load_inputs(out, config.tasks, digests, scene)
+        try:
+            return load_inputs(out, config.tasks, digests, scene)
+        except ValueError:
+            # Killed before its first checkpoint, a run may lack its copies of what is named.
+            if not has_checkpoint(out / "checkpoint"):
+                if arguments.encoders is not None:
+                    return pretrained_for(config.tasks, scene=scene, weights=arguments.encoders)
+                if found := _repeated(arguments, config):
+                    return found
+            raise
     # A bank fits only the encoders that embedded it.
     given = arguments.encoders is not None or bank is not None
     if not (given or arguments.train_encoders) and (found := _repeated(arguments, config)):

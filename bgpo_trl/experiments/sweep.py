@@ -24,7 +24,7 @@ from bgpo_trl.algorithms import ABLATIONS
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.experiments.arguments import Arguments, Setting, SweepArguments
 from bgpo_trl.experiments.command_line import import_plugin
-from bgpo_trl.experiments.run import run_experiment
+from bgpo_trl.experiments.run import check_inputs, run_experiment
 from bgpo_trl.experiments.settings import run_config
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.writing import lock_directory
@@ -67,7 +67,8 @@ def make_jobs(arguments: SweepArguments) -> list[Job]:
 
     Raises:
         ValueError: If the settings are invalid, the grid is empty, or the directory of a job holds
-            a run with other settings.
+            a run with other settings, encoders or demonstrations, or of another version of the
+            scene.
     """
     if arguments.block < 1 or arguments.cpus_per_run <= 0 or arguments.gpus_per_run < 0:
         raise ValueError(
@@ -92,8 +93,13 @@ def make_jobs(arguments: SweepArguments) -> list[Job]:
             directory = arguments.out.absolute() / folder / "-".join(["seeds", *map(str, block)])
             jobs.append(Job(directory, replace(config, seeds=block), files))
             path = directory / "config.json"
-            if path.exists() and read_config(path)[0] != jobs[-1].config:
-                raise ValueError(f"{directory} holds a run with other settings: name another --out")
+            if path.exists():
+                saved, digests = read_config(path)
+                if saved != jobs[-1].config:
+                    raise ValueError(
+                        f"{directory} holds a run with other settings: name another --out"
+                    )
+                check_inputs(files, saved, directory, digests)
     return jobs
 
 

@@ -10,8 +10,8 @@ from typing import Any
 
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
 from bgpo_trl.files.csv_file import CsvFile
-from bgpo_trl.files.writing import make_folder, write_json
-from bgpo_trl.runs.results import COLUMNS, read_json
+from bgpo_trl.files.writing import make_folder, write_json, write_whole
+from bgpo_trl.runs.results import COLUMNS, read_json, read_table
 
 _CSV_FILES = ("train.csv", "eval.csv")  # to which a run appends rows
 _NAMED = 5  # differing settings that an error names
@@ -56,6 +56,12 @@ def load_last(directory: Path, settings: Mapping[str, Any]) -> dict[str, Any] | 
         if not path.exists() or path.stat().st_size < state["position"][name]:
             raise ValueError(f"{path} lacks rows from before the checkpoint: {_REMEDY}")
     return state
+
+
+def check_settings(directory: Path, settings: Mapping[str, Any]) -> None:
+    """Raise ``ValueError`` if a run has others than these of its settings, such as ``bank``."""
+    saved = read_json(directory / "config.json")
+    _compare(directory, saved, {**saved, **settings})
 
 
 def read_checkpoint(
@@ -140,6 +146,37 @@ def _as_grown(saved: Mapping[str, Any], settings: Mapping[str, Any]) -> Mapping[
     ):
         grown |= {name: settings.get(name) for name in (*of_tasks, "bank")}
     return grown
+
+
+@contextlib.contextmanager
+def replacing_costs(directory: Path) -> Iterator[None]:
+    """Keep the costs of the last checkpoint while the block replaces both.
+
+    See `put_back_costs`. Checkpoints hold no costs, in which equal runs differ.
+    """
+    now, before = _costs(directory)
+    if has_checkpoint(before.parent) and now.exists() and not before.exists():
+        write_whole(before, now.read_bytes())
+    yield
+    before.unlink(missing_ok=True)
+
+
+def put_back_costs(directory: Path, steps: int) -> None:
+    """Put back the costs of a checkpoint, of so many steps, if a kill came before the next one.
+
+    Raises:
+        ValueError: If they are damaged.
+    """
+    now, before = _costs(directory)
+    if before.exists():
+        if read_table(before)["steps"].sum() == steps:
+            before.replace(now)
+        else:  # the kill came after the next one
+            before.unlink()
+
+
+def _costs(directory: Path) -> tuple[Path, Path]:
+    return directory / "cost.csv", directory / "checkpoint" / "cost.csv"
 
 
 def flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

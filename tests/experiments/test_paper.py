@@ -20,6 +20,7 @@ from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis.comparison import NAMES
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.encoders.pretrained import default_weights
+from bgpo_trl.encoders.representation import save_representation
 from bgpo_trl.experiments import measure
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.experiments.arguments import Arguments
@@ -29,6 +30,7 @@ from bgpo_trl.experiments.run import concurrent, continual
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.demonstrations import own_weights
 from bgpo_trl.runs.results import read_run, read_table
+from bgpo_trl.scenes import SCENES
 from suites import nico
 from tests.helpers import Recorder, cells, contents, edit, rows, spied
 
@@ -115,7 +117,7 @@ def test_a_finished_run_is_only_changed_by_making_it_longer(
     with monkeypatch.context() as patch:
         for name in ("load_pretrained", "make_pretrained", "Trainer", "measure", "draw"):
             patch.delattr(experiment, name)
-        for same in (again, replace(again, episodes=6), replace(again, train_encoders=True)):
+        for same in (again, replace(again, episodes=6), replace(again, encoders=own_weights(run))):
             assert continual(same).startswith(f"{run} is finished, all 6 episodes")
     assert contents(run) == before
 
@@ -123,12 +125,8 @@ def test_a_finished_run_is_only_changed_by_making_it_longer(
     for other in ({"episodes": 5}, seed, every, {"episodes": 9, **every}):
         changed = partial(continual, replace(again, **other))
         refused(changed, "holds a run with other settings", "choose another")
-    with_others = replace(again, episodes=9, encoders=default_weights())
-    refused(partial(continual, with_others), "--encoders: ", "was begun with the encoders")
     two = replace(again, episodes=9, tasks=TASKS[:2])
     refused(partial(continual, two), f"has the tasks {', '.join(TASKS)}", "leave the flag out")
-    trained = replace(again, episodes=9, train_encoders=True)
-    refused(partial(continual, trained), "--train-encoders: ", "leave the flag out")
     from_start = partial(concurrent, replace(again, episodes=9))
     refused(from_start, "task_starts is [0, 2, 4] there", "choose another")
 
@@ -149,6 +147,30 @@ def test_a_finished_run_is_only_changed_by_making_it_longer(
     assert kept == (9, [0, 2, 4], 2)
     assert json_of(run, "summary")["episodes"] == 9
     assert continual(replace(again, episodes=9)).startswith(f"{run} is finished, all 9 episodes")
+
+
+@pytest.mark.parametrize("episodes", [6, 9])
+def test_a_run_is_continued_or_found_finished_with_its_own_files_alone(
+    undrawn, tmp_path, monkeypatch, refused, encoders, bank, episodes
+):
+    run, none = tmp_path / "run", tmp_path / "none.safetensors"
+    continual(Arguments(out=run))
+    own = {"encoder_id": encoders.identity, "scene": encoders.metadata["scene"]}
+    replace(bank, embedding=bank.embedding + 1, **own).save(tmp_path / "other.safetensors")
+    other_bank = {"bank": tmp_path / "other.safetensors", "encoders": own_weights(run)}
+    again = Arguments(out=run, resume=True, episodes=episodes)
+    for files, cause, remedy in (
+        ({"encoders": default_weights()}, "was begun with the encoders", "leave the flag out"),
+        ({"encoders": none}, "no encoder weights", "train some"),
+        ({"train_encoders": True}, "was begun with encoders", "leave the flag out"),
+        (other_bank, "bank is ", "choose another"),
+        ({**other_bank, "bank": none}, "none.safetensors", "bgpo bank"),
+        ({"logged": tmp_path}, str(tmp_path), ": "),
+    ):
+        refused(partial(continual, replace(again, **files)), cause, remedy)
+    changed = replace(SCENES["nico"], version="2")
+    monkeypatch.setitem(SCENES, "nico", changed)
+    refused(partial(continual, again), changed.full_version, ": ")
 
 
 def test_a_run_is_continued_and_repeated_with_its_own_settings(
@@ -282,6 +304,29 @@ def test_a_run_that_was_interrupted_while_it_made_encoders_is_resumed(
     refused(lambda: continual(arguments), "beginning of new encoders", "add --train-encoders")
     continual(replace(arguments, train_encoders=True))
     assert (tmp_path / "summary.json").exists()
+
+
+@pytest.mark.parametrize("named", ["encoders", "config"])
+@pytest.mark.parametrize("unwritten", ["training.keep_inputs", "data.bank.DemonstrationBank.save"])
+def test_a_run_that_was_killed_before_it_kept_what_is_named_is_resumed(
+    undrawn, tmp_path, monkeypatch, encoders, named, unwritten
+):
+    run, files = tmp_path / "run", {name: tmp_path / name for name in ("encoders", "config")}
+    save_representation(encoders, files["encoders"])
+    continual(Arguments(out=files["config"], episodes=2))
+    arguments = Arguments(out=run, episodes=2, **{named: files[named]})
+
+    def kill(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(f"bgpo_trl.{unwritten}", kill)
+        with pytest.raises(KeyboardInterrupt):
+            continual(arguments)
+    assert not (run / "checkpoint").exists()
+    continual(replace(arguments, resume=True))
+    assert (run / "summary.json").exists()
+    assert own_weights(run).exists() and (run / "bank.safetensors").exists()
 
 
 def test_new_encoders_are_trained_with_the_settings_of_a_file(

@@ -16,9 +16,11 @@ from eight_tasks import EightTasksArguments
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import PRESETS
+from bgpo_trl.encoders.pretrained import bank_path, default_weights, load_pretrained
 from bgpo_trl.experiments import sweep
 from bgpo_trl.experiments.sweep import SweepArguments
 from bgpo_trl.runs.config_file import Digests, settings_of
+from bgpo_trl.scenes import SCENES
 from suites import nico
 from tests.helpers import contents
 
@@ -27,10 +29,10 @@ ROOT = Path(__file__).parents[2]
 FEW = {"algorithms": ("bgpo", "maml"), "seeds": (4, 0, 2), "block": 2, "preset": "quick"}
 
 
-def write_run(job):
+def write_run(job, digests=("some", "bank")):
     """Write the files by which a finished job is known."""
     job.directory.mkdir(parents=True, exist_ok=True)
-    settings = settings_of(job.config, Digests("some", "bank"))
+    settings = settings_of(job.config, Digests(*digests))
     (job.directory / "config.json").write_text(json.dumps(settings))
     (job.directory / "final.csv").touch()
     (job.directory / "summary.json").write_text(f'{{"episodes": {job.config.episodes}}}')
@@ -107,6 +109,37 @@ def test_directories_of_other_runs_are_refused(tmp_path, refused):
     sweep.make_jobs(SweepArguments(out=tmp_path, **FEW))
     other = SweepArguments(out=tmp_path, episodes=7, **FEW)
     refused(lambda: sweep.sweep(other), "seeds-2 holds a run with other settings", "name another")
+
+
+def test_a_finished_sweep_has_its_files_and_its_version_of_the_scene_alone(
+    tmp_path, monkeypatch, refused
+):
+    weights = default_weights()
+    encoders, bank = load_pretrained()
+    same = SweepArguments(
+        settings=("concurrent",), encoders=weights, bank=bank_path(weights), out=tmp_path
+    )
+    (job,) = sweep.make_jobs(same)
+    write_run(job, (encoders.identity, bank.for_tasks(job.config.tasks).identity))
+    for arguments in (same, replace(same, encoders=None, bank=None)):
+        assert sweep.sweep(arguments).startswith("jobs: 1, run: 0;")
+    none = tmp_path / "none.safetensors"
+    others = replace(bank, embedding=bank.embedding + 1)
+    others.save(tmp_path / "other.safetensors")
+    eight = default_weights(nico.ALL_TASKS)
+    for files, cause, remedy in (
+        ({"encoders": eight}, "was begun with the encoders", "leave the flag out"),
+        ({"encoders": none}, "no encoder weights", "train some"),
+        ({"bank": tmp_path / "other.safetensors"}, "bank is ", "choose another"),
+        ({"bank": none}, "none.safetensors", "bgpo bank"),
+    ):
+        refused(lambda files=files: sweep.sweep(replace(same, **files)), cause, remedy)
+    monkeypatch.setitem(SCENES, "nico", replace(SCENES["nico"], version="2"))
+    refused(
+        lambda: sweep.sweep(replace(same, encoders=None, bank=None)),
+        "scene_version is ",
+        "choose another",
+    )
 
 
 def test_a_sweep_runs_each_job_once(tmp_path, monkeypatch):
