@@ -101,6 +101,7 @@ def _final_tests(trainer: Trainer, bank: DemonstrationBank, *, episodes: int) ->
         evaluator = _evaluator(trainer, tested, episodes)
         snapshots = evaluator.snapshots(algorithm, _LAST)
         result = evaluator.run(snapshots, algorithm.device, watch=bar.update)
+        evaluator.env.close()  # hundreds of simulations, of several MB each
         success = result.success
         bar.set_postfix_str(f"success {success.float().mean():.2f}, {kind}", refresh=False)
         bar.update(half * n_steps - bar.n)  # episodes may all end earlier

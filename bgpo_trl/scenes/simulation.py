@@ -249,10 +249,10 @@ class SimulationEnv(EnvBase):
         return pixels.reshape(*self.batch_size, *pixels.shape[1:])
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """End the threads and close the simulations."""
+        """End the threads, close the simulations and let go of them."""
         self._threads.close()
-        for simulation in self.simulations:
-            simulation.close()
+        while self.simulations:
+            self.simulations.pop().close()
         super().close(raise_if_closed=raise_if_closed)
 
     def _set_seed(self, seed: int | None) -> None:

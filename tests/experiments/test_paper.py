@@ -47,6 +47,23 @@ def json_of(run, name):
     return json.loads((run / f"{name}.json").read_text())
 
 
+def test_simulations_of_final_tests_are_closed_before_there_are_more(
+    tiniest, tmp_path, monkeypatch
+):
+    made = []
+
+    class Watched(measure.Evaluator):
+        def __init__(self, *given, **named):
+            assert all(other.env.is_closed and not other.simulation.simulations for other in made)
+            made.append(self)
+            super().__init__(*given, **named)
+            assert self.simulation.simulations
+
+    monkeypatch.setattr(measure, "Evaluator", Watched)
+    concurrent(Arguments(out=tmp_path / "run"))
+    assert len(made) >= 2
+
+
 def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path, refused):
     run = tmp_path / "a run"
     printed = concurrent(Arguments(out=run))
