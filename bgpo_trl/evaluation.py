@@ -99,8 +99,9 @@ class Evaluator:
         if missing:
             task = config.tasks[missing[0]]
             raise ValueError(
-                f"the bank has no held-out demonstration of {task!r}: hold some out of each task "
-                "(held_out_per_task), and embed them anew"
+                f"the bank has no held-out demonstration of {task!r} in the {config.held_out} "
+                "half: hold two out of each task (held_out_per_task), as each half needs one, and "
+                "embed them anew"
             )
         self._bank = bank
         self.simulation = scene.simulate(

@@ -60,8 +60,10 @@ class World:
 
         That of simulations is None if they cannot be saved.
         """
+        # An environment of one's own need not have it.
+        save = getattr(self.simulation, "simulation_state", None)
         try:
-            simulation = self.simulation.simulation_state()
+            simulation = None if save is None else save()
         except NotImplementedError:
             simulation = None
         return {"source": dict(self.source.state_dict()), "simulation": simulation}

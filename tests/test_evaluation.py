@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -215,6 +216,17 @@ def test_a_bank_without_a_held_out_demonstration_of_a_task_is_refused(bank, enco
     incomplete = DemonstrationBank(bank.embedding, bank.task, train, bank.tasks).held_out()
     with pytest.raises(ValueError, match=f"no held-out demonstration of {nico.PAPER_TASKS[1]!r}"):
         Evaluator(make_config(), incomplete, encoders, episodes=1)
+
+
+def test_a_half_without_a_held_out_demonstration_is_named(bank, encoders, make_config, refused):
+    """Of one that is held out of each task, the test half has none."""
+    rows = [(bank.task == task).nonzero()[0] for task in range(3)]
+    train = torch.ones_like(bank.train).index_fill(0, torch.cat(rows), False)
+    single = DemonstrationBank(bank.embedding, bank.task, train, bank.tasks)
+    parts = {"encoders": encoders, "episodes": 1}
+    Evaluator(make_config(), single.held_out("validation"), **parts)
+    test = partial(Evaluator, make_config(held_out="test"), single.held_out("test"), **parts)
+    refused(test, "in the test half", "hold two out of each task (held_out_per_task), as each half")
 
 
 def test_success_of_random_actions_equals_a_plain_loop(easy_world):

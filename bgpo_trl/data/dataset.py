@@ -482,7 +482,7 @@ def _check_episode(scene: Scene, episode: Mapping[str, Any]) -> int:
             raise ValueError(f"has numbers in {key} that are not finite: leave the episode out")
     largest = np.abs(np.asarray(episode.get("action", 0), np.float32)).max()
     if largest > 1:
-        raise ValueError(f"has an action of size {largest:.4g}: scale actions to [-1, 1]")
+        raise ValueError(f"has an action of size {largest!s}: scale actions to [-1, 1]")
     return length
 
 

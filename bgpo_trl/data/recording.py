@@ -78,7 +78,8 @@ def record_demonstrations(
 
     Raises:
         ValueError: If an argument is invalid, ``path`` holds another recording, the scene has no
-            demonstrator, or `check_scene` finds it wrong; there is a warning for what it doubts.
+            demonstrator or no `Simulation`, or `check_scene` finds it wrong; there is a warning for
+            what it doubts.
         OSError: If there is not enough disk space.
         RuntimeError: If there is no OpenGL to render with, or a demonstrator fails too often;
             earlier rows are kept.
@@ -130,6 +131,12 @@ def record_demonstrations(
         warnings.warn(f"the scene {scene.name!r}: {doubt}", stacklevel=2)
     env = scene.simulate(tasks, batch_size=1, spread=spread)
     with contextlib.closing(env):
+        if not hasattr(env, "simulations"):
+            raise ValueError(
+                f"demonstrators cannot act in the {type(env).__name__} of the scene "
+                f"{scene.name!r}, which has no simulations: write demonstrations that you have, "
+                "with write_demonstrations (docs/extending.md)"
+            )
         dataset = open_dataset(path, wanted) if started else make_dataset(path, wanted)
         if not started:
             write_json(path / META, wanted)
@@ -260,9 +267,7 @@ def perform(
             found = short_repr(action.tolist())
             raise ValueError(f"{whose} has the action {found}: give {scene.action_size}, finite")
         if (largest := np.float32(np.abs(action).max())) > 1:
-            raise ValueError(
-                f"{whose} has an action of size {largest:.4g}: scale actions to [-1, 1]"
-            )
+            raise ValueError(f"{whose} has an action of size {largest!s}: scale actions to [-1, 1]")
         success, failure, executed = checked_step(simulation, action)
         actions.append(executed)
         moments.append(observe())

@@ -78,13 +78,15 @@ def play(policy: TrainedPolicy, task: str, demonstration: NDArray, seed: int) ->
             f"the scene {scene.name!r} is a physical robot, which commands do not move: let it act "
             "in your own program (docs/deploy.md)"
         )
-    state, seen, views = env.reset(), [env.frames()[0]], [_view(env.simulations[0])]
+    # An environment of one's own has no `Simulation`.
+    simulation = env.simulations[0] if hasattr(env, "simulations") else None
+    state, seen, views = env.reset(), [env.frames()[0]], [_view(simulation)]
     for _ in range(config.algorithm.max_steps):
         joints = state["joints"][0].numpy() if reads_joints else None
         action = torch.from_numpy(policy.act(seen[-1], joints))
         state = env.step(state.set("action", action.unsqueeze(0)))["next"]
         seen.append(env.frames()[0])
-        views.append(_view(env.simulations[0]))
+        views.append(_view(simulation))
         if state["done"].any():
             break
     env.close()
@@ -93,8 +95,10 @@ def play(policy: TrainedPolicy, task: str, demonstration: NDArray, seed: int) ->
     return Episode(task, demonstration, np.stack(seen), view, success)
 
 
-def _view(simulation: Simulation) -> NDArray | None:
+def _view(simulation: Simulation | None) -> NDArray | None:
     """Return an onlooker's view, uint8 ``[128, W, 3]``; None if there is none."""
+    if simulation is None:
+        return None
     try:
         view = Image.fromarray(simulation.view())
     except NotImplementedError:

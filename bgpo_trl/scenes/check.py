@@ -33,7 +33,8 @@ def check_scene(scene: Scene, tasks: Sequence[str] | None = None) -> list[str]:
     Doubtful is a start that is always the same, a task that is solved without movement, a frame
     that differs when it is asked for again, an action that the frame after it does not show, a
     component of actions that no frame shows, and a simulation that goes on differently after
-    `Simulation.load`. A physical robot (`RobotEnv`) is not moved, and nothing is said of it.
+    `Simulation.load`. A physical robot (`RobotEnv`) is not moved, an ``EnvBase`` of one's own has
+    no `Simulation` to try, and nothing is said of either.
 
     Args:
         scene: The robot, with a simulation.
@@ -50,7 +51,7 @@ def check_scene(scene: Scene, tasks: Sequence[str] | None = None) -> list[str]:
         for _ in range(2):
             env = scene.simulate(tasks, batch_size=1)
             opened.callback(env.close)
-            if isinstance(env, RobotEnv):
+            if isinstance(env, RobotEnv) or not hasattr(env, "simulations"):
                 return []
             simulations += env.simulations
         doubts = list[str]()

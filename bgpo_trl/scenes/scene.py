@@ -191,6 +191,9 @@ class StateColumns:
     valid: Callable[[Any], Any] | None = None
 
     def __post_init__(self) -> None:
+        # Of NumPy's numbers, torch would make float64.
+        for name in ("center", "scale"):
+            object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
         if len(self.center) != len(self.scale):
             raise ValueError(
                 f"center has {len(self.center)} columns, scale has {len(self.scale)}: give as many"
@@ -246,8 +249,8 @@ class Scene:
         own_tasks: Names of the tasks that come with the scene; all of them if None.
         make_env: Constructor of the environment, which gets the tasks, the `sizes` and what
             `simulate` is given; a ``spread`` only with ``has_spread``. It is `SimulationEnv` around
-            a `Simulation`, or an ``EnvBase`` with the same keys, attributes and methods. Without
-            one, the scene serves demonstrations, encoders, banks and trained policies.
+            a `Simulation`, or an ``EnvBase`` with the same keys, ``seed_rows`` and ``frames``.
+            Without one, the scene serves demonstrations, encoders, banks and trained policies.
         frame_shape: Height and width of a frame, at least 16 each.
         action_size: Number of components of an action, each in [-1, 1].
         max_steps: Length of the longest episode.

@@ -126,7 +126,8 @@ class DemonstrationSource(EpisodeTransform):
 
     Raises:
         ValueError: If the bank has wrong shapes or no demonstration of a task, the number of
-            generators is wrong, or the environment has another batch size or ignores the task.
+            generators is wrong, the environment has another batch size or ignores the task, or no
+            task is available at a reset.
 
     Examples:
         >>> from types import SimpleNamespace
@@ -196,6 +197,11 @@ class DemonstrationSource(EpisodeTransform):
         for tasks, stream, episode in zip(available, streams, episodes, strict=True):
             rng = np.random.default_rng((stream, episode))
             choices = [some for t, some in zip(tasks, self._demonstrations, strict=True) if t]
+            if not choices:
+                raise ValueError(
+                    f"no task of {type(self.schedule).__name__} is available after {episode} "
+                    "episodes: let its available() return one at least"
+                )
             demonstrations = choices[rng.integers(len(choices))]
             drawn.append(int(demonstrations[rng.integers(len(demonstrations))]))
         self._demo_index[rows] = torch.tensor(drawn, dtype=torch.int64, device=rows.device)

@@ -189,6 +189,7 @@ MISSING = {**episodes_of(), TASKS[1]: [episode_of(2), episode_of(7), None, episo
         (changed(action=np.zeros((6, 4))), "has the action float64 [6, 4]", "[5, 4]"),
         (changed(action=[["left"] * 4] * 5), "has the action", "give [5, 4] numbers"),
         (changed(action=np.full((5, 4), -1.5)), "an action of size 1.5", "scale actions"),
+        (changed(action=np.full((5, 4), 1.0001)), "an action of size 1.0001:", "scale actions"),
         (
             changed(action=np.full((5, 4), np.nan)),
             "action that are not finite",

@@ -330,10 +330,21 @@ def test_a_ground_truth_is_divided_by_numbers_above_zero(column):
         StateColumns(center=(0.0, center), scale=(1.0, scale))
 
 
+def test_columns_of_numpy_are_plain_numbers():
+    """Of those, torch makes float64, with which networks do not compute."""
+    means = np.array([0.25, 1.5])
+    for center, scale in ((means, means), ([*means], (*means,)), ([0, 1], np.float32([1, 2]))):
+        columns = StateColumns(center=center, scale=scale)
+        for given, found in ((center, columns.center), (scale, columns.scale)):
+            assert found == (*given,)
+            assert torch.tensor(found).dtype == torch.float32
+
+
 @pytest.mark.parametrize(
     ("action", "message"),
     [
         ([1.5], "has an action of size 1.5: scale actions"),
+        ([-1.0001], "has an action of size 1.0001: scale actions"),
         ([np.nan], r"has the action \[nan\]: give 1, finite"),
         ([0.5, 0.5], r"has the action \[0.5, 0.5\]: give 1, finite"),
     ],

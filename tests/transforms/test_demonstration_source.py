@@ -138,6 +138,16 @@ def test_an_environment_that_ignores_the_task_is_refused():
         env.reset()
 
 
+def test_a_schedule_that_runs_out_of_tasks_is_refused():
+    def available(episode):
+        return (episode < 2).unsqueeze(-1).expand(*episode.shape, 3)
+
+    env, _ = make(lengths=3, schedule=SimpleNamespace(n_tasks=3, available=available))
+    play(env, 5)  # an episode to its end, the next one not
+    with pytest.raises(ValueError, match=r"no task .* available after 2 episodes: let its avail"):
+        play(env, 3)
+
+
 def test_bad_arguments_and_wrong_orders_are_refused():
     bank, both = make_bank(n_tasks=2), TaskSchedule((0, 0))
     one_missing = SimpleNamespace(embedding=bank.embedding, task=bank.task[1:])
